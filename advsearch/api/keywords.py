@@ -455,3 +455,8 @@ def _replace_control_objects(settings: dict[str, Any], name: str) -> Sequence[An
         check_no_worker_settings(settings)
     settings[name] = loading.controls_to_settings(controls)
     return instances
+
+
+def drop_unset(keywords: Mapping[str, object]) -> dict[str, Any]:
+    """Return the settings that a caller passed as keywords; None counts as not passed."""
+    return {name: value for name, value in keywords.items() if value is not None}

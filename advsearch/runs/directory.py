@@ -166,18 +166,33 @@ class RunDirectory:
             with storage_errors(path):
                 _clear(path)
             try:
-                if config is not None:
-                    write_text(path / CONFIG, config.make_repeatable().to_yaml())
-                run_directory = cls(path, lock)
-                undo.callback(run_directory.store.close)
-                if config is not None:
-                    run_directory._note_start(config)
+                run_directory = cls._write_start(path, config, lock, undo)
             except BaseException:
                 with suppress(OSError):  # the first error is raised in any case
                     _clear(path)
                 raise
             undo.pop_all()  # nothing failed: the caller closes it
             return run_directory
+
+    @classmethod
+    def _write_start(
+        cls, path: Path, config: Config | None, lock: RunLock, undo: ExitStack
+    ) -> RunDirectory:
+        """Write the first files of a run into its directory, which is locked.
+
+        Args:
+            path: path of the directory.
+            config: configuration of the run, which is written as `run.yaml`, or None.
+            lock: lock of the directory.
+            undo: gets what closes the store after an error.
+        """
+        if config is not None:
+            write_text(path / CONFIG, config.make_repeatable().to_yaml())
+        run_directory = cls(path, lock)
+        undo.callback(run_directory.store.close)
+        if config is not None:
+            run_directory._note_start(config)
+        return run_directory
 
     @classmethod
     def open(cls, config: Config, resumed: str | Path | None = None) -> RunDirectory:
@@ -261,9 +276,8 @@ class RunDirectory:
             self.store.write_note(
                 PYTHON_ONLY_NOTE, json.dumps(config.python_only_parts)
             )
-        self.check_unchanged(
-            summary.VERSIONS_NOTE, summary.collect_versions(_known_settings(config))
-        )
+        versions = summary.collect_versions(_known_settings(config))
+        self.check_unchanged(summary.VERSIONS_NOTE, versions)
         # This note is the last one: if it exists, the others were stored, too.
         self.check_unchanged(SETTINGS_NOTE, config.get_deciding_settings())
 
@@ -273,29 +287,28 @@ class RunDirectory:
         Raises:
             InputError: some are not, so that it would give other numbers.
         """
-        # A run without stored settings was killed before `_note_start` ended. It has no
-        # rows, and begins now.
         has_settings = self.store.read_note(SETTINGS_NOTE) is not None
         if not has_settings:
-            if self.store.count_rows():
-                raise FileFormatError(
-                    f"{self.store.path}: expected the settings the "
-                    "run began with, got none"
-                )
-            self._note_start(config)
+            self._begin_killed_run(config)
             return
         self.check_unchanged(SETTINGS_NOTE, config.get_deciding_settings())
-        # Only files that a resumed run reads again are compared. One that the run has
-        # copied into its store, such as a recipe, may have changed or be missing.
-        settings_of_files = {
-            name: value
-            for name, value in _known_settings(config).items()
-            if name not in summary.NOT_READ_AGAIN
-        }
-        # versions of packages, and digests of the files that these settings name
-        self.check_unchanged(
-            summary.VERSIONS_NOTE, summary.collect_versions(settings_of_files)
-        )
+        # versions of packages, and digests of files that a resumed run reads again
+        versions = summary.collect_versions(_select_read_settings(config))
+        self.check_unchanged(summary.VERSIONS_NOTE, versions)
+
+    def _begin_killed_run(self, config: Config) -> None:
+        """Begin a run that was killed before `_note_start` ended.
+
+        It has no stored settings and no rows.
+
+        Raises:
+            FileFormatError: it has rows.
+        """
+        if self.store.count_rows():
+            raise FileFormatError(
+                f"{self.store.path}: expected the settings the run began with, got none"
+            )
+        self._note_start(config)
 
     def check_unchanged(self, note: str, facts: Mapping[str, Any]) -> None:
         """Check that facts on which the numbers of a run depend have not changed.
@@ -312,6 +325,24 @@ class RunDirectory:
             InputError: a fact differs from the stored one; the run
                 can't go on.
         """
+        before = self._read_facts(note)
+        changed = summary.find_changed_facts(before, facts)
+        if changed:
+            changes = [_format_change(name, before.get(name)) for name in changed]
+            raise InputError(
+                f"{self.path}: cannot resume with something else than the run began "
+                f"with: {', '.join(changes)}; restore it, or {self.restart_advice}"
+            )
+        has_new_facts = not facts.keys() <= before.keys()
+        if has_new_facts:  # the stored values of known facts stay
+            self.store.write_note(note, json.dumps({**facts, **before}))
+
+    def _read_facts(self, note: str) -> dict[str, Any]:
+        """Return the facts in a note; empty if there is no such note.
+
+        Raises:
+            FileFormatError: the note has something else.
+        """
         stored = self.store.read_json_note(note)
         before = {} if stored is None else stored  # None at the first call
         if not isinstance(before, dict):
@@ -320,17 +351,7 @@ class RunDirectory:
                 f"{self.store.path}: expected what the run began with in the note "
                 f"{note!r}, got {type_name}"
             )
-        if changed := summary.find_changed_facts(before, facts):
-            changes = ", ".join(
-                _format_change(name, before.get(name)) for name in changed
-            )
-            raise InputError(
-                f"{self.path}: cannot resume with something else than the run began "
-                f"with: {changes}; restore it, or {self.restart_advice}"
-            )
-        has_new_facts = not facts.keys() <= before.keys()
-        if has_new_facts:  # the stored values of known facts stay
-            self.store.write_note(note, json.dumps({**facts, **before}))
+        return before
 
     def check_files_unchanged(self, used_settings: Iterable[Mapping[str, Any]]) -> None:
         """Check that the files that settings name are those with which the run began.
@@ -484,17 +505,29 @@ class RunDirectory:
 
         Without an error it is checked first that it was not moved in the meantime.
         """
-        # A new directory is removed only if the block raised before it stored anything.
         if error is None:
             try:
                 check_not_moved(self.path)
             finally:
                 self.close()
-            return
-        if self._is_new and self.is_empty:
+        elif self._is_new and self.is_empty:
+            # the block raised before it stored anything
             self.discard()
         else:
             self.close()
+
+
+def _select_read_settings(config: Config) -> dict[str, Any]:
+    """Return the settings of a run, without those of files that it does not read again.
+
+    A run has copied such a file, a recipe say, into its store. Then the file may have
+    changed or be missing.
+    """
+    return {
+        name: value
+        for name, value in _known_settings(config).items()
+        if name not in summary.NOT_READ_AGAIN
+    }
 
 
 @contextmanager
@@ -519,24 +552,38 @@ def create_before_work(config: Config) -> Iterator[Path | None]:
         yield None
         return
     home = HOME if location is None else locate_run(location).parent
-    # parent folders that do not exist yet, the innermost first
-    new_folders = [
-        parent for parent in (home, *home.parents) if not os.path.exists(parent)
-    ]
+    new_folders = _list_missing_folders(home)
     with RunDirectory.create_for(config) as run:
         path = run.path
     try:
         yield path
     except BaseException:
-        # The directory cannot be opened if it was removed meanwhile, for instance.
-        with suppress(AdvsearchError), closing(RunDirectory.resume(path)) as run:
-            if run.is_empty:
-                run.discard()
-        # `rmdir` raises for a folder that is not empty, and so ends the loop
-        with suppress(OSError):
-            for folder in new_folders:
-                folder.rmdir()
+        _discard_if_empty(path, new_folders)
         raise
+
+
+def _list_missing_folders(folder: Path) -> list[Path]:
+    """Return those of a folder and its parents that do not exist, the innermost first."""
+    return [
+        parent for parent in (folder, *folder.parents) if not os.path.exists(parent)
+    ]
+
+
+def _discard_if_empty(path: Path, new_folders: Sequence[Path]) -> None:
+    """Remove the directory of a run without results, and empty folders around it.
+
+    Args:
+        path: path of the directory.
+        new_folders: parent folders that were made for it, the innermost first.
+    """
+    # The directory cannot be opened if it was removed meanwhile, for instance.
+    with suppress(AdvsearchError), closing(RunDirectory.resume(path)) as run:
+        if run.is_empty:
+            run.discard()
+    # `rmdir` raises for a folder that is not empty, and so ends the loop
+    with suppress(OSError):
+        for folder in new_folders:
+            folder.rmdir()
 
 
 def make_default_name(object_name: str, controls: Iterable[str]) -> str:
@@ -654,21 +701,10 @@ def check_free(run: str | Path, *, overwrite: bool = False) -> None:
             `overwrite`, a run.
     """
     path = locate_run(run)
-    if "\0" in str(path):
-        raise InputError(
-            f"expected a name or a folder for the run, got {str(path)!r} "
-            "with a zero byte in it"
-        )
-    if os.path.exists(path) and not path.is_dir():
-        raise RunExistsError(
-            f"{path}: expected a folder for the run, got a file; "
-            "choose another name with `run`"
-        )
+    _check_possible_folder(path)
     with storage_errors(path):
-        is_free = not path.exists() or all(
-            _is_leftover(entry) for entry in path.iterdir()
-        )
-    if is_free:  # nothing is there, or leftovers of a run that was killed at its start
+        is_free = not path.exists() or _has_only_leftovers(path)
+    if is_free:
         return
     if not is_run(path):
         raise RunExistsError(
@@ -678,6 +714,30 @@ def check_free(run: str | Path, *, overwrite: bool = False) -> None:
     if not overwrite:
         raise RunExistsError(
             f"{path}: the run exists already; add `overwrite=True` or "
+            "choose another name with `run`"
+        )
+
+
+def _has_only_leftovers(folder: Path) -> bool:
+    """Return whether a folder has nothing but what a run killed at its start leaves."""
+    return all(_is_leftover(entry) for entry in folder.iterdir())
+
+
+def _check_possible_folder(path: Path) -> None:
+    """Check that a path may be that of a folder.
+
+    Raises:
+        InputError: it is no possible path.
+        RunExistsError: it is a file.
+    """
+    if "\0" in str(path):
+        raise InputError(
+            f"expected a name or a folder for the run, got {str(path)!r} "
+            "with a zero byte in it"
+        )
+    if os.path.exists(path) and not path.is_dir():
+        raise RunExistsError(
+            f"{path}: expected a folder for the run, got a file; "
             "choose another name with `run`"
         )
 
@@ -696,15 +756,22 @@ def _make_numbered_directory(default: str) -> Path:
             for path in HOME.iterdir()
             if (match := pattern.fullmatch(path.name))
         ]
-        # Another process may take a number between listing and mkdir: then the next one
-        # is tried.
-        for number in itertools.count(max(used_numbers, default=0) + 1):
-            path = HOME / f"{default}-{number:03d}"
-            try:
-                path.mkdir()
-            except FileExistsError:
-                continue
-            return path
+        return _make_first_free(default, max(used_numbers, default=0) + 1)
+
+
+def _make_first_free(default: str, first: int) -> Path:
+    """Make and return the first free directory of a name with a number, from `first` on.
+
+    Another process may take a number between listing and mkdir: then the next one is
+    tried.
+    """
+    for number in itertools.count(first):
+        path = HOME / f"{default}-{number:03d}"
+        try:
+            path.mkdir()
+        except FileExistsError:
+            continue
+        return path
     raise AssertionError("unreachable: `count` does not end")
 
 

@@ -14,7 +14,7 @@ import io
 import itertools
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import IO, Any, TypeGuard
@@ -28,6 +28,8 @@ from advsearch.trust.writing import name_setting_in_errors, replace_file
 
 FORMATS = ("csv", "json", "parquet")
 PAYLOAD = "payload"
+# writes records as a table with named columns to a stream
+WriteTable = Callable[[Iterable[JsonObject], list[str], IO[bytes]], None]
 LEADING_COLUMNS = (
     *(
         "id",
@@ -70,14 +72,10 @@ def write_rows(
     Raises:
         UnknownNameError: there is no such format or kind.
     """
-    if format not in FORMATS:
-        raise UnknownNameError("format", format, FORMATS)
+    write_table = _find_writer(format)
     counts = store.count_by_kind()
     if kind is not None and kind not in counts:
         raise UnknownNameError("kind of rows", kind, counts)
-    write_table = {"csv": _write_csv, "json": _write_json, "parquet": _write_parquet}[
-        format
-    ]
     # all rows are read twice, since the columns have to be known first
     names = list_columns(store.rows(kind))
     if out is None:
@@ -90,6 +88,18 @@ def write_rows(
         ):
             write_table(map(make_record, store.rows(kind)), names, file)
     return counts[kind] if kind is not None else sum(counts.values())
+
+
+def _find_writer(format: str) -> WriteTable:
+    """Return the function that writes a table in a format.
+
+    Raises:
+        UnknownNameError: there is no such format.
+    """
+    if format not in FORMATS:
+        raise UnknownNameError("format", format, FORMATS)
+    writers = {"csv": _write_csv, "json": _write_json, "parquet": _write_parquet}
+    return writers[format]
 
 
 def list_columns(rows: Iterable[Row]) -> list[str]:
@@ -129,11 +139,7 @@ def iterate_values(
             the value alone, which has no unit.
     """
     for name, entry in values.items():
-        value: Any = entry
-        unit = ""
-        if isinstance(entry, Mapping):
-            value = entry.get("value")
-            unit = str(entry.get("unit") or "")
+        value, unit = _split_unit(entry)
         if isinstance(value, (list, tuple)):
             yield from (
                 (f"{name}[{index}]", component, unit)
@@ -141,6 +147,13 @@ def iterate_values(
             )
         else:
             yield name, value, unit
+
+
+def _split_unit(entry: Value | JsonValue) -> tuple[Any, str]:
+    """Return a value of a row and its unit; a value alone has no unit."""
+    if isinstance(entry, Mapping):
+        return entry.get("value"), str(entry.get("unit") or "")
+    return entry, ""
 
 
 def _flatten_values(values: Mapping[str, Value | JsonValue]) -> JsonObject:
@@ -213,6 +226,23 @@ def _write_parquet(
     They are written in groups of `ROWS_PER_GROUP`, so that no more are in memory. The
     types of columns follow from the first group.
     """
+    pyarrow = _import_pyarrow()
+    rows = map(_encode_payload, records)
+    group = list(itertools.islice(rows, ROWS_PER_GROUP))
+    schema = _make_schema(names, group)
+    with pyarrow.parquet.ParquetWriter(stream, schema) as writer:
+        while group:
+            columns = _make_columns(group, names, schema.types)
+            writer.write_table(pyarrow.table(columns, schema))
+            group = list(itertools.islice(rows, ROWS_PER_GROUP))
+
+
+def _import_pyarrow() -> Any:
+    """Return the package that writes Parquet.
+
+    Raises:
+        InputError: it is not installed.
+    """
     try:
         # comes with the extra `parquet`
         import pyarrow.parquet
@@ -220,17 +250,24 @@ def _write_parquet(
         raise InputError(
             "format parquet: needs pyarrow; pip install pyarrow, or choose csv or json"
         ) from None
-    rows = map(_encode_payload, records)
-    group = list(itertools.islice(rows, ROWS_PER_GROUP))
-    schema = _make_schema(names, group)
-    with pyarrow.parquet.ParquetWriter(stream, schema) as writer:
-        while group:
-            columns: dict[str, list[Any]] = {}
-            for name, arrow_type in zip(names, schema.types, strict=True):
-                values = [record.get(name) for record in group]
-                columns[name] = _convert_column(values, arrow_type)
-            writer.write_table(pyarrow.table(columns, schema))
-            group = list(itertools.islice(rows, ROWS_PER_GROUP))
+    return pyarrow
+
+
+def _make_columns(
+    group: Sequence[JsonObject], names: Sequence[str], arrow_types: Sequence[Any]
+) -> dict[str, list[Any]]:
+    """Return a group of records as columns with values of their types.
+
+    Args:
+        group: the records.
+        names: names of the columns.
+        arrow_types: types of the columns, of Arrow.
+    """
+    columns: dict[str, list[Any]] = {}
+    for name, arrow_type in zip(names, arrow_types, strict=True):
+        values = [record.get(name) for record in group]
+        columns[name] = _convert_column(values, arrow_type)
+    return columns
 
 
 def _make_schema(names: list[str], first_records: Sequence[JsonObject]) -> Any:
@@ -303,24 +340,36 @@ def read_threedb(folder: Path) -> Iterator[tuple[Row, Path | None]]:
             line.
     """
     class_names = _read_classes(folder / CLASSES)
-    try:
-        file = open_regular(folder / DETAILS, "the log of 3DB", MAX_LOG_BYTES)
-    except OSError as error:
-        raise FileFormatError(
-            f"{folder / DETAILS}: expected the log of 3DB, got {error.strerror}"
-        ) from None
-    with file:
+    with _open_log(folder) as file:
         for number in itertools.count():
             # one byte more than allowed shows that a line is too long
             line = file.readline(MAX_LINE_BYTES + 1)
             if not line:  # the end of the file; an empty line has its line break
                 return
-            if len(line) > MAX_LINE_BYTES:
-                raise _make_line_error(
-                    folder, number, f"more than {MAX_LINE_BYTES} bytes"
-                )
+            _check_line_length(folder, number, line)
             if line.strip():
                 yield _parse_line(folder, number, line, class_names)
+
+
+def _check_line_length(folder: Path, number: int, line: bytes) -> None:
+    """Raise an error if a line of 3DB's log is too long; see `_parse_line`."""
+    if len(line) > MAX_LINE_BYTES:
+        reason = f"more than {MAX_LINE_BYTES} bytes"
+        raise _make_line_error(folder, number, reason)
+
+
+def _open_log(folder: Path) -> IO[bytes]:
+    """Open the log of 3DB in a folder.
+
+    Raises:
+        FileFormatError: it cannot be opened.
+    """
+    try:
+        return open_regular(folder / DETAILS, "the log of 3DB", MAX_LOG_BYTES)
+    except OSError as error:
+        raise FileFormatError(
+            f"{folder / DETAILS}: expected the log of 3DB, got {error.strerror}"
+        ) from None
 
 
 def _read_classes(path: Path) -> list[str]:
@@ -358,13 +407,7 @@ def _parse_line(
     Raises:
         FileFormatError: the line is not as 3DB writes it.
     """
-    try:
-        record = parse_json(line.decode())
-    except ValueError as error:
-        raise _make_line_error(folder, number, str(error)) from None
-    render_args = record.get("render_args") if isinstance(record, dict) else None
-    if not isinstance(record, dict) or not isinstance(render_args, dict):
-        raise _make_line_error(folder, number, "a line without render_args")
+    record, render_args = _parse_record(folder, number, line)
     label, label_index = _parse_prediction(record.get("prediction"), classes)
     loss = record.get("loss")
     row = Row(
@@ -380,6 +423,26 @@ def _parse_line(
         values=_import_values(record, render_args),
     )
     return row, _find_picture(folder, str(record.get("id")))
+
+
+def _parse_record(
+    folder: Path, number: int, line: bytes
+) -> tuple[JsonObject, JsonObject]:
+    """Return the JSON object of a line, and the parameters in it.
+
+    See `_parse_line` for the arguments.
+
+    Raises:
+        FileFormatError: the line has no such object.
+    """
+    try:
+        record = parse_json(line.decode())
+    except ValueError as error:
+        raise _make_line_error(folder, number, str(error)) from None
+    render_args = record.get("render_args") if isinstance(record, dict) else None
+    if not isinstance(record, dict) or not isinstance(render_args, dict):
+        raise _make_line_error(folder, number, "a line without render_args")
+    return record, render_args
 
 
 def _import_values(record: JsonObject, render_args: JsonObject) -> dict[str, Value]:

@@ -134,18 +134,22 @@ def check_version(db: sqlite3.Connection, path: Path) -> None:
     version = read_version(db)
     if version == VERSION:
         return
-    day = ""  # the day on which the file was created, if it is stored
-    with suppress(sqlite3.Error):
-        created = db.execute("SELECT value FROM meta WHERE key = 'created'").fetchone()
-        if created:
-            day = f", that of {str(created[0])[:10]}"
+    advice = f"read it with the advsearch that wrote it{_describe_creation(db)}"
     db.close()
-    advice = f"read it with the advsearch that wrote it{day}"
     if version == 0:  # the default of SQLite, in a database whose tables are missing
         advice = "it is not a finished results.sqlite"
     raise FileFormatError(
         f"{path}: expected version {VERSION} of the results, got {version}; {advice}"
     )
+
+
+def _describe_creation(db: sqlite3.Connection) -> str:
+    """Return the day on which a database was created, as a clause; empty if unknown."""
+    with suppress(sqlite3.Error):
+        created = db.execute("SELECT value FROM meta WHERE key = 'created'").fetchone()
+        if created:
+            return f", that of {str(created[0])[:10]}"
+    return ""
 
 
 # --------------------------------------------------------------------------------
@@ -314,13 +318,7 @@ def encode_animation(frames: Sequence[Any]) -> bytes:
     count = min(len(frames), ANIMATION_FRAMES)
     shrink = 1  # factor by which sides are smaller than ANIMATION_SIDE
     while True:
-        # evenly spaced, with the first and the last frame
-        indices = np.rint(np.linspace(0, len(frames) - 1, count)).astype(int)
-        pictures = [
-            Image.fromarray(_check_image_shape(to_8bit(frames[index])))
-            for index in indices
-        ]
-        pictures = _shrink_images(pictures, shrink)
+        pictures = _shrink_images(_select_frames(frames, count), shrink)
         data = _encode_gif(pictures)
         is_minimal = min(pictures[0].size) < MIN_ANIMATION_SIDE
         if len(data) <= ANIMATION_BYTES or is_minimal:
@@ -331,6 +329,14 @@ def encode_animation(frames: Sequence[Any]) -> bytes:
             count = min(count * 9 // 10, fitting_count)  # at least a tenth less
         else:
             shrink *= 2
+
+
+def _select_frames(frames: Sequence[Any], count: int) -> list[Image.Image]:
+    """Return evenly spaced frames as 8-bit images, with the first and the last one."""
+    indices = np.rint(np.linspace(0, len(frames) - 1, count)).astype(int)
+    return [
+        Image.fromarray(_check_image_shape(to_8bit(frames[index]))) for index in indices
+    ]
 
 
 def _shrink_images(images: Sequence[Image.Image], shrink: int) -> list[Image.Image]:
@@ -359,29 +365,37 @@ def _encode_gif(pictures: Sequence[Image.Image]) -> bytes:
 
     One palette of 256 colors serves all frames.
     """
-    pixels = np.concatenate([np.asarray(picture) for picture in pictures])
-    # To be fast, the palette is made from every `stride`-th row of pixels, about
-    # `_PALETTE_PIXELS` in all.
-    stride = 1 + pixels.shape[0] * pixels.shape[1] // _PALETTE_PIXELS
-    palette = Image.fromarray(np.ascontiguousarray(pixels[::stride])).quantize(256)
+    palette = _make_palette(pictures)
     frames = [
         picture.quantize(palette=palette, dither=Image.Dither.NONE)
         for picture in pictures
     ]
-    is_animated = len(frames) > 1
-    durations: Any = LAST_FRAME_MS
-    if is_animated:
-        durations = [FRAME_MS] * (len(frames) - 1) + [LAST_FRAME_MS]
     buffer = io.BytesIO()
     frames[0].save(
         buffer,
         "GIF",
         loop=0,
-        duration=durations,
-        save_all=is_animated,
+        duration=_list_durations(len(frames)),
+        save_all=len(frames) > 1,
         append_images=frames[1:],
     )
     return buffer.getvalue()
+
+
+def _list_durations(n_frames: int) -> int | list[int]:
+    """Return the milliseconds of each frame of an animation, or of a single image."""
+    if n_frames == 1:
+        return LAST_FRAME_MS
+    return [FRAME_MS] * (n_frames - 1) + [LAST_FRAME_MS]
+
+
+def _make_palette(pictures: Sequence[Image.Image]) -> Image.Image:
+    """Return an image with the palette of 256 colors that fits all of the images."""
+    pixels = np.concatenate([np.asarray(picture) for picture in pictures])
+    # To be fast, the palette is made from every `stride`-th row of pixels, about
+    # `_PALETTE_PIXELS` in all.
+    stride = 1 + pixels.shape[0] * pixels.shape[1] // _PALETTE_PIXELS
+    return Image.fromarray(np.ascontiguousarray(pixels[::stride])).quantize(256)
 
 
 def _check_image_shape(array: Any) -> Any:

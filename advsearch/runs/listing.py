@@ -85,6 +85,7 @@ def can_resume(path: Path) -> bool:
         return results.has_cached
 
 
+# by path and `counts`, the state of the files when they were read, and the entry
 _LISTED: dict[tuple[str, bool], tuple[object, ListedRun]] = {}
 
 
@@ -100,30 +101,49 @@ def read_listed_run(path: Path, *, counts: bool = True) -> ListedRun:
         counts: whether to count its rows, which takes a second for a million.
     """
     running = is_held(path)
-    read_paths = [
-        path / name for name in (CONFIG, summary.NAME, store.NAME, f"{store.NAME}-wal")
-    ]
-    # The cache has, by key, the state of the files (their times and sizes) when they
-    # were read, and the entry. The state has the path as it was passed, too, since the
-    # entry contains it.
     key = (os.path.abspath(path), counts)
-    state = (str(path), running, *map(_state, read_paths))
+    state = _find_state_of_files(path, running)
     is_cached = key in _LISTED and _LISTED[key][0] == state
     count_may_change = running and counts
     if not is_cached or count_may_change:
-        faults: list[str] = []
-        try:
-            check_links(path)
-            listed = _make_listed_run(path, counts, running, faults)
-        # whatever is wrong with one run, the others are listed
-        except Exception as error:
-            fault = f"{FAULT}: {type(error).__name__}"
-            if isinstance(error, AdvsearchError):
-                fault = str(error)
-            faults.append(fault)
-            listed = _make_damaged_run(path)
-        _LISTED[key] = state, replace(listed, fault=faults[0] if faults else "")
+        _LISTED[key] = state, _read_checked_run(path, counts, running)
     return _LISTED[key][1]
+
+
+def _find_state_of_files(path: Path, running: bool) -> tuple[object, ...]:
+    """Return a value that changes when the entry of a run in the list may change.
+
+    It has the times and sizes of the files that are read. It has the path as it was
+    passed, too, since the entry contains it.
+
+    Args:
+        path: path of the run.
+        running: whether a process works on the run.
+    """
+    names = (CONFIG, summary.NAME, store.NAME, f"{store.NAME}-wal")
+    return (str(path), running, *(_state(path / name) for name in names))
+
+
+def _read_checked_run(path: Path, counts: bool, running: bool) -> ListedRun:
+    """Read the entry of a run in the list of runs, with a fault if there is any.
+
+    Args:
+        path: path of the run.
+        counts: whether to count its rows.
+        running: whether a process works on the run.
+    """
+    faults: list[str] = []
+    try:
+        check_links(path)
+        listed = _make_listed_run(path, counts, running, faults)
+    # whatever is wrong with one run, the others are listed
+    except Exception as error:
+        fault = f"{FAULT}: {type(error).__name__}"
+        if isinstance(error, AdvsearchError):
+            fault = str(error)
+        faults.append(fault)
+        listed = _make_damaged_run(path)
+    return replace(listed, fault=faults[0] if faults else "")
 
 
 def _make_damaged_run(path: Path) -> ListedRun:
@@ -168,34 +188,16 @@ def _make_listed_run(
         running: whether a process works on the run.
         faults: list of sentences, to which those about this run are added.
     """
-    config: dict[str, object] = {}
-    result: Result | None = None
-    kinds: dict[str, int] = {}
-    # an error in one of these blocks is added to the faults, and not raised
-    with _collect_faults(faults, path / CONFIG):
-        config = read_yaml(path / CONFIG)
-    with _collect_faults(faults, path / summary.NAME):
-        result = summary.read_result(path)
-    if counts:
-        with (
-            _collect_faults(faults, path / store.NAME),
-            store.Store(path / store.NAME, read_only=True) as results,
-        ):
-            kinds = results.count_by_kind()
+    config = _read_listed_config(path, faults)
+    result = _read_listed_result(path, faults)
+    kinds = _count_stored_rows(path, faults) if counts else {}
     command = config.get("command") or (result.command if result else "?")
-    object_name = config.get("object") or _get_object_names(result)
-    # If the settings could be read, the command has no object, and the name is empty.
-    if not object_name and not config:
-        object_name = "?"
-    controls = getattr(result, "controls", ()) or config.get("controls") or ()
-    if not isinstance(controls, (list, tuple, dict)):
-        controls = ("?",)
     return ListedRun(
         path.name,
         str(path),
         command=str(command),
-        object=str(object_name),
-        controls=tuple(map(str, controls)),
+        object=_name_listed_objects(config, result),
+        controls=_name_listed_controls(config, result),
         rows=sum(kinds.values()),
         state=_find_state(result, running),
         outcome=result.outcome_summary if result else "",
@@ -203,6 +205,69 @@ def _make_listed_run(
         started=bool(config),
         when=_find_start_time(path),
     )
+
+
+def _read_listed_config(path: Path, faults: list[str]) -> dict[str, object]:
+    """Return the settings of a run; empty if they cannot be read.
+
+    Args:
+        path: path of the run.
+        faults: list of sentences, to which one about the file may be added.
+    """
+    config: dict[str, object] = {}
+    # an error is added to the faults, and not raised
+    with _collect_faults(faults, path / CONFIG):
+        config = read_yaml(path / CONFIG)
+    return config
+
+
+def _read_listed_result(path: Path, faults: list[str]) -> Result | None:
+    """Return the result of a run; None if it cannot be read.
+
+    Args:
+        path: path of the run.
+        faults: list of sentences, to which one about the file may be added.
+    """
+    result: Result | None = None
+    # an error is added to the faults, and not raised
+    with _collect_faults(faults, path / summary.NAME):
+        result = summary.read_result(path)
+    return result
+
+
+def _count_stored_rows(path: Path, faults: list[str]) -> dict[str, int]:
+    """Count the rows of a run by kind; none if they cannot be read.
+
+    Args:
+        path: path of the run.
+        faults: list of sentences, to which one about the store may be added.
+    """
+    kinds: dict[str, int] = {}
+    with (
+        _collect_faults(faults, path / store.NAME),
+        store.Store(path / store.NAME, read_only=True) as results,
+    ):
+        kinds = results.count_by_kind()
+    return kinds
+
+
+def _name_listed_objects(config: Mapping[str, object], result: Result | None) -> str:
+    """Return the objects of a run, from its settings or else from its result."""
+    object_name = config.get("object") or _get_object_names(result)
+    # If the settings could be read, the command has no object, and the name is empty.
+    if not object_name and not config:
+        return "?"
+    return str(object_name)
+
+
+def _name_listed_controls(
+    config: Mapping[str, object], result: Result | None
+) -> tuple[str, ...]:
+    """Return the names of the controls of a run, from its result or its settings."""
+    controls = getattr(result, "controls", ()) or config.get("controls") or ()
+    if not isinstance(controls, (list, tuple, dict)):
+        controls = ("?",)
+    return tuple(map(str, controls))
 
 
 def _find_state(result: Result | None, running: bool) -> str:

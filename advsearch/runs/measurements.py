@@ -130,6 +130,18 @@ class Measurements:
                 first.
             make_result: makes the result from the rows so far.
         """
+        collected_rows = self._collect_rows(rows, make_result)
+        result = make_result(collected_rows)
+        earlier_result = self._find_earlier_result(type(result))
+        return result if earlier_result is None else earlier_result
+
+    def _collect_rows(
+        self, rows: Iterable[Row], make_result: Callable[[list[Row]], AnyResult]
+    ) -> list[Row]:
+        """Collect rows until they end or are interrupted, and set the ending of the run.
+
+        See `make_result_of_rows` for the arguments.
+        """
         context = self._context
         collected_rows: list[Row] = []
         # The status in summaries that are written before the last row. It is replaced
@@ -146,14 +158,23 @@ class Measurements:
             pass  # the status stays `INTERRUPTED`
         except OutOfTime:
             context.ending = OUT_OF_TIME
-        result = make_result(collected_rows)
-        # Stored rows come first. If the user interrupted before any new row, some
-        # stored rows may not have been read, and the earlier result may have more rows.
+        return collected_rows
+
+    def _find_earlier_result(self, kind: type[AnyResult]) -> AnyResult | None:
+        """Return the earlier result of an interrupted run; None if it is not needed.
+
+        Stored rows come first. If the user interrupted before any new row, some stored
+        rows may not have been read, and the earlier result may have more rows.
+
+        Args:
+            kind: class of the result.
+        """
+        run = self._context.run
         may_lack_stored_rows = (
-            context.ending == INTERRUPTED and not self.n_new_measurements
+            self._context.ending == INTERRUPTED and not self.n_new_measurements
         )
-        if may_lack_stored_rows and (context.run.path / NAME).is_file():
-            earlier_result = read_stored_result(context.run.path)
-            if isinstance(earlier_result, type(result)):
+        if may_lack_stored_rows and (run.path / NAME).is_file():
+            earlier_result = read_stored_result(run.path)
+            if isinstance(earlier_result, kind):
                 return earlier_result
-        return result
+        return None

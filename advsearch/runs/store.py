@@ -203,20 +203,40 @@ class Store:
         with storage_errors(self.path):
             self._db.execute(f"PRAGMA synchronous = {mode}")
             with self._db:  # one transaction
-                self._db.executemany(_INSERT, (_encode(row, timestamp) for row in rows))
-                if cached is not None:
-                    row = rows[-1]
-                    self._db.execute(
-                        _INSERT_CACHED, (*_encode_cached(cached), row.kind, row.step)
-                    )
+                self._insert(rows, cached, timestamp)
         if must_sync:
-            end_time = time.monotonic()
-            # includes the time for encoding, which is short
-            sync_seconds = end_time - start_time
-            # On a slow disk the wait is longer, so that syncing takes at most
-            # `SYNC_SHARE` of the time.
-            wait_seconds = max(SYNC_INTERVAL, sync_seconds / SYNC_SHARE)
-            self._next_sync = end_time + wait_seconds
+            self._schedule_sync(start_time)
+
+    def _insert(
+        self, rows: Sequence[Row], cached: CachedEvaluation | None, timestamp: float
+    ) -> None:
+        """Insert rows, and what belongs to the last one, into the tables.
+
+        Args:
+            rows: rows of evaluations.
+            cached: data that a search needs and the last row lacks; None without any.
+            timestamp: the time of writing, seconds since 1970.
+        """
+        self._db.executemany(_INSERT, (_encode(row, timestamp) for row in rows))
+        if cached is not None:
+            row = rows[-1]
+            values = (*_encode_cached(cached), row.kind, row.step)
+            self._db.execute(_INSERT_CACHED, values)
+
+    def _schedule_sync(self, start_time: float) -> None:
+        """Set when the next write waits for the disk, after one that did.
+
+        On a slow disk it is later, so that waiting takes at most `SYNC_SHARE` of the
+        time.
+
+        Args:
+            start_time: monotonic time when the last write began.
+        """
+        end_time = time.monotonic()
+        # includes the time for encoding, which is short
+        sync_seconds = end_time - start_time
+        wait_seconds = max(SYNC_INTERVAL, sync_seconds / SYNC_SHARE)
+        self._next_sync = end_time + wait_seconds
 
     def _select(self, query: str, *parameters: Any) -> Iterator[Any]:
         """Yield the rows of a SELECT query.
@@ -425,19 +445,11 @@ def _encode_cached(cached: CachedEvaluation) -> tuple[Any, ...]:
     Arrays become bytes. The height of the picture is stored as well; its width follows
     from the number of bytes.
     """
-    arrays = [
-        None if array is None else array.tobytes()
-        for array in (cached.gradient, cached.picture)
-    ]
+    gradient = None if cached.gradient is None else cached.gradient.tobytes()
+    picture = None if cached.picture is None else cached.picture.tobytes()
     height = None if cached.picture is None else len(cached.picture)
-    return (
-        cached.number,
-        cached.u,
-        cached.non_finite,
-        cached.cost,
-        *arrays,
-        height,
-    )
+    numbers = (cached.number, cached.u, cached.non_finite, cached.cost)
+    return (*numbers, gradient, picture, height)
 
 
 def _encode(row: Row, stamp: float) -> tuple[Any, ...]:
@@ -570,23 +582,32 @@ def _decode_cached(values: tuple[Any, ...], path: Path) -> CachedEvaluation:
     Raises:
         FileFormatError: a column has another type, or the picture another size.
     """
-    number, u_digest, non_finite, cost, gradient, picture, height = values
     try:
-        types = [type(value) for value in (number, u_digest, non_finite, cost)]
-        if types != [int, bytes, int, int]:
-            raise TypeError("a column of another type")
-        if gradient is not None:
-            gradient = np.frombuffer(gradient, np.float32)
-        if picture is not None:
-            picture = np.frombuffer(picture, np.uint8).reshape(height, -1, 3)
-        return CachedEvaluation(
-            number, u_digest, non_finite, cost, gradient=gradient, picture=picture
-        )
+        return _make_cached(values)
     except (TypeError, ValueError) as error:
         raise FileFormatError(
             f"{path}: expected the cached evaluations of a search, got something else "
             f"({error})"
         ) from None
+
+
+def _make_cached(values: tuple[Any, ...]) -> CachedEvaluation:
+    """Return a cached evaluation from the values of `_CACHED_COLUMNS`.
+
+    Raises:
+        TypeError, ValueError: a column has another type, or the picture another size.
+    """
+    number, u_digest, non_finite, cost, gradient, picture, height = values
+    types = [type(value) for value in (number, u_digest, non_finite, cost)]
+    if types != [int, bytes, int, int]:
+        raise TypeError("a column of another type")
+    if gradient is not None:
+        gradient = np.frombuffer(gradient, np.float32)
+    if picture is not None:
+        picture = np.frombuffer(picture, np.uint8).reshape(height, -1, 3)
+    return CachedEvaluation(
+        number, u_digest, non_finite, cost, gradient=gradient, picture=picture
+    )
 
 
 def _parse_named(text: str, fits: Callable[[Any], bool]) -> dict[str, Any] | None:

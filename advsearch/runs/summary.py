@@ -26,7 +26,7 @@ from pydantic import ValidationError
 
 from advsearch.config import DEFAULT_ENVIRONMENT
 from advsearch.errors import FileFormatError
-from advsearch.files import split_paths
+from advsearch.files import JsonObject, split_paths
 from advsearch.runs.results import RUNNING, SCHEMA, Result, find_result_type
 from advsearch.settings.configuration import FILES
 from advsearch.trust.stored_files import (
@@ -76,10 +76,31 @@ def read_stored_result(folder: Path) -> Result:
             version writes.
     """
     path = folder / NAME
+    values = _read_summary_values(path)
+    result_type = find_result_type(values)  # the class of the experiment's result
+    if result_type is None:
+        command = str(values.get("command"))[:MAX_TEXT_IN_ERROR]
+        raise make_summary_error(path, f"one of the command {command!r}")
     try:
-        values = parse_json(
-            read_text(path, "the summary of a run", MAX_SUMMARY_BYTES), finite=True
+        return result_type.from_values(values)
+    except ValidationError as error:
+        reason = _describe_first_error(error)
+        got = (
+            f"one with a part that is missing or of another type ({reason}); run it "
+            "again"
         )
+        raise make_summary_error(path, got) from None
+
+
+def _read_summary_values(path: Path) -> JsonObject:
+    """Return the JSON object in a `summary.json` of this version.
+
+    Raises:
+        FileFormatError: there is no such file, or it has something else.
+    """
+    try:
+        text = read_text(path, "the summary of a run", MAX_SUMMARY_BYTES)
+        values = parse_json(text, finite=True)
     except FileNotFoundError:
         # the summary is the last file of a run
         raise make_summary_error(path, "no such file; did the run end?") from None
@@ -87,29 +108,29 @@ def read_stored_result(folder: Path) -> Result:
         raise make_summary_error(path, str(error)) from None
     if not isinstance(values, dict):
         raise make_summary_error(path, type(values).__name__)
+    _check_schema(path, values)
+    return values
+
+
+MAX_TEXT_IN_ERROR = 40  # characters of a text of a summary in an error
+
+
+def _check_schema(path: Path, values: JsonObject) -> None:
+    """Raise an error if a summary, the file `path`, has the schema of another version."""
     if values.get("schema", SCHEMA) != SCHEMA:
+        schema = str(values["schema"])[:MAX_TEXT_IN_ERROR]
         raise make_summary_error(
             path,
-            f"schema {str(values['schema'])[:40]} of another version (this one writes "
+            f"schema {schema} of another version (this one writes "
             f"{SCHEMA}); run it again",
         )
-    result_type = find_result_type(values)  # the class of the experiment's result
-    if result_type is None:
-        raise make_summary_error(
-            path, f"one of the command {str(values.get('command'))[:40]!r}"
-        )
-    try:
-        return result_type.from_values(values)
-    except ValidationError as error:
-        # The message states the first error only, and no values, which may be long.
-        first = error.errors(include_url=False, include_input=False)[0]
-        field_name = ".".join(map(str, first["loc"]))
-        reason = f"{field_name}: {first['msg']}"[:120]
-        got = (
-            f"one with a part that is missing or of another type ({reason}); run it "
-            "again"
-        )
-        raise make_summary_error(path, got) from None
+
+
+def _describe_first_error(error: ValidationError) -> str:
+    """Return the first error of a validation, without values, which may be long."""
+    first = error.errors(include_url=False, include_input=False)[0]
+    field_name = ".".join(map(str, first["loc"]))
+    return f"{field_name}: {first['msg']}"[:120]
 
 
 def make_summary_error(path: Path, got: str) -> FileFormatError:
@@ -151,6 +172,20 @@ def read_configuration(run: Path) -> NDArray[np.float32]:
         FileFormatError: there is none, or the file holds something else.
     """
     path = run / FOLDER / CONFIGURATION
+    u = _parse_array(_read_array_file(path))
+    if u is None or not bool(((u >= 0.0) & (u <= 1.0)).all()):
+        raise FileFormatError(
+            f"{path}: expected numbers (d,) float32 in [0, 1], got something else"
+        )
+    return u
+
+
+def _read_array_file(path: Path) -> bytes:
+    """Return the content of the file of an adversarial configuration.
+
+    Raises:
+        FileFormatError: there is none, or it does not begin as a .npy file does.
+    """
     expected = f"{path}: expected the adversarial configuration of a run, got"
     try:
         data = read_bytes(
@@ -164,12 +199,7 @@ def read_configuration(run: Path) -> NDArray[np.float32]:
     has_header_end = b"\n" in data[: len(MAGIC) + MAX_HEADER_BYTES]
     if not data.startswith(MAGIC) or not has_header_end:
         raise FileFormatError(f"{expected} something else, or the beginning of one")
-    u = _parse_array(data)
-    if u is None or not bool(((u >= 0.0) & (u <= 1.0)).all()):
-        raise FileFormatError(
-            f"{path}: expected numbers (d,) float32 in [0, 1], got something else"
-        )
-    return u
+    return data
 
 
 def _parse_array(data: bytes) -> NDArray[np.float32] | None:
@@ -387,12 +417,7 @@ def _iterate_digests(setting: str, path: str) -> Iterator[tuple[str, str]]:
     # The file itself and those read for it; empty if this process has not read it.
     opened_files = list_opened_files(absolute_path)
 
-    # Only an absolute path counts as a folder, and the folder of a model hf:FOLDER.
-    folder = ""
-    if os.path.isabs(path):
-        folder = path
-    elif path.startswith("hf:"):
-        folder = path.removeprefix("hf:")
+    folder = _find_folder(path)
     if folder and setting in FOLDERS and Path(folder).is_dir():
         file_pattern = FOLDERS[setting]
         yield folder, _digest_folder(Path(folder), file_pattern)
@@ -404,11 +429,29 @@ def _iterate_digests(setting: str, path: str) -> Iterator[tuple[str, str]]:
 
     for opened_file in opened_files:
         if opened_file != absolute_path and Path(opened_file).is_file():
-            # Its name in the result is relative to the current directory if `path` is,
-            # and absolute otherwise.
-            relative = os.path.relpath(opened_file, os.path.dirname(absolute_path))
-            file_name = os.path.join(os.path.dirname(path), relative)
+            file_name = _name_as_path(opened_file, path)
             yield file_name, _digest_file(Path(opened_file))
+
+
+def _name_as_path(file: str, path: str) -> str:
+    """Return the path of a file, relative to the current directory if another path is.
+
+    Args:
+        file: absolute path of the file.
+        path: the other path, relative or absolute.
+    """
+    folder = os.path.dirname(os.path.abspath(path))
+    return os.path.join(os.path.dirname(path), os.path.relpath(file, folder))
+
+
+def _find_folder(path: str) -> str:
+    """Return the folder that a path may be; empty if it cannot be one.
+
+    Only an absolute path counts as a folder, and the folder of a model hf:FOLDER.
+    """
+    if os.path.isabs(path):
+        return path
+    return path.removeprefix("hf:") if path.startswith("hf:") else ""
 
 
 def _digest_folder(folder: Path, pattern: str) -> str:
@@ -446,14 +489,18 @@ def _find_paths(value: object) -> Iterator[str]:
             yield from _find_paths(inner)
     elif isinstance(value, str):
         for name in value.split(","):
-            parts = (
-                name,
-                name.rpartition("@")[2],
-                name.partition("#")[0],
-                *split_paths(name),
-            )
-            # each of them once
-            yield from dict.fromkeys(part.strip() for part in parts if part.strip())
+            yield from _split_paths_in_name(name)
+
+
+def _split_paths_in_name(name: str) -> list[str]:
+    """Return a name and its parts that may be paths, each of them once."""
+    parts = (
+        name,
+        name.rpartition("@")[2],
+        name.partition("#")[0],
+        *split_paths(name),
+    )
+    return list(dict.fromkeys(part.strip() for part in parts if part.strip()))
 
 
 def _digest_file(path: Path) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
 from itertools import islice
@@ -133,19 +133,27 @@ class Units:
         draw = image_index // self.noise  # `noise` consecutive images have one draw
         if self.frames is None:
             return draw
-        # Draws are numbered by point of the grid, then by sample. A point has an index
-        # along each axis, the last one fastest, so it is
-        # (index_before * n_frames + frame) * n_after + index_after.
-        # Leaving out the frame gives all frames of a drive the same number.
+        # Draws are numbered by point of the grid, then by sample.
         point = draw // self.samples
         sample = draw % self.samples
-        n_frames = self.sizes[self.frames]
-        n_after = prod(self.sizes[self.frames + 1 :])  # points along the axes after
+        return self._leave_out_frame(point, self.frames) * self.samples + sample
+
+    def _leave_out_frame(self, point: Number, frame_axis: int) -> Number:
+        """Return a number of a point of the grid that all frames of its drive share.
+
+        A point has an index along each axis, the last one fastest, so its number is
+        (index_before * n_frames + frame) * n_after + index_after.
+
+        Args:
+            point: number of the point in the sweep, or an array of numbers.
+            frame_axis: index of the axis of the frames.
+        """
+        n_frames = self.sizes[frame_axis]
+        n_after = prod(self.sizes[frame_axis + 1 :])  # points along the axes after
         # The index along the axes before also counts scenes, as an axis before all.
         index_before = point // (n_frames * n_after)
         index_after = point % n_after
-        point_without_frame = index_before * n_after + index_after
-        return point_without_frame * self.samples + sample
+        return index_before * n_after + index_after
 
 
 def read_units(store: Store, *, is_sampled: bool = True) -> Units | None:
@@ -171,16 +179,20 @@ def read_units(store: Store, *, is_sampled: bool = True) -> Units | None:
         # are repetitions with other noise.
         if not is_sampled and units.noise == 1:
             units = replace(units, samples=1, noise=units.samples)
-        is_frame_axis_valid = units.frames is None or units.frames < len(units.sizes)
-        # larger numbers would overflow int64
-        n_rows = prod(units.sizes) * units.samples * units.noise * units.models
-        n_photograph_images = units.photographs * units.scene
-        are_counts_valid = max(n_rows, n_photograph_images) <= MAX_ROWS
-        if is_frame_axis_valid and are_counts_valid:
+        if _are_possible(units):
             return units
     raise FileFormatError(
         f"{store.path}: expected the units of a sweep, got {str(noted)[:80]}"
     )
+
+
+def _are_possible(units: Units) -> bool:
+    """Return whether the frames are an axis, and all numbers fit into int64."""
+    is_frame_axis_valid = units.frames is None or units.frames < len(units.sizes)
+    n_rows = prod(units.sizes) * units.samples * units.noise * units.models
+    n_photograph_images = units.photographs * units.scene
+    are_counts_valid = max(n_rows, n_photograph_images) <= MAX_ROWS
+    return is_frame_axis_valid and are_counts_valid
 
 
 KIND = "sweep"  # rows of the sweep itself
@@ -254,9 +266,8 @@ def read_sweep(
         FileFormatError: the results cannot be read.
     """
     with Store(run / NAME, read_only=True) as store:
-        frame = make_sweep_frame(
-            islice(store.rows(KIND, after=after), max_rows), extra_columns
-        )
+        rows = islice(store.rows(KIND, after=after), max_rows)
+        frame = make_sweep_frame(rows, extra_columns)
         noted = store.read_json_note(EDGES_NOTE)
         units = read_units(store, is_sampled=is_sampled)
     frame.attrs["unit name"] = PICTURE
@@ -312,20 +323,26 @@ def make_sweep_frame(
         {**_make_cells(row, number, units), **get_extra_columns(row)}
         for number, row in enumerate(rows, 1)
     )
-    frames = list[pd.DataFrame]()
-    # in chunks, since a list of all cells would take far more memory than the frame
-    while chunk := list(islice(cells, CHUNK_ROWS)):
-        frames.append(_make_chunk_frame(chunk))
-    if frames:
-        frame = pd.concat(frames, ignore_index=True)
-    else:
-        frame = pd.DataFrame(dict.fromkeys(FIXED_COLUMNS, np.zeros(0)))
+    frame = _make_joined_frame(cells)
     for name in frame.select_dtypes("object"):
         frame[name] = _to_categories(frame[name])
     frame = frame.astype({"id": np.int64, "step": np.int64})
     frame["unit"] = frame["step"]
     frame.attrs |= {"units": units, "edges": {}}
     return frame
+
+
+def _make_joined_frame(cells: Iterator[Mapping[str, Any]]) -> pd.DataFrame:
+    """Return rows of cells as a frame, made in chunks of `CHUNK_ROWS` rows.
+
+    A list of all cells would take far more memory than the frame.
+    """
+    frames = list[pd.DataFrame]()
+    while chunk := list(islice(cells, CHUNK_ROWS)):
+        frames.append(_make_chunk_frame(chunk))
+    if frames:
+        return pd.concat(frames, ignore_index=True)
+    return pd.DataFrame(dict.fromkeys(FIXED_COLUMNS, np.zeros(0)))
 
 
 def _make_chunk_frame(cells: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
@@ -347,12 +364,6 @@ def _make_cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
         units: units of measurement by column, to which those of the row's parameters
             are added.
     """
-    if row.label:
-        label = row.label
-    elif row.correct is None:  # the prediction was not evaluated
-        label = ""
-    else:  # it was, and the output of the model was NaN or infinite
-        label = NOT_A_NUMBER
     outcome = get_outcome(row.payload)
     # in the order of `FIXED_COLUMNS`
     fixed_values = (
@@ -362,10 +373,21 @@ def _make_cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
         row.margin,
         row.probability,
         row.seconds,
-        label,
+        _find_row_label(row),
         "" if outcome is None else outcome.value,
     )
-    cells: dict[str, Any] = dict(zip(FIXED_COLUMNS, fixed_values, strict=True))
+    fixed_cells = dict(zip(FIXED_COLUMNS, fixed_values, strict=True))
+    return {**fixed_cells, **_make_parameter_cells(row, units)}
+
+
+def _make_parameter_cells(row: Row, units: dict[str, str]) -> dict[str, Any]:
+    """Return the values of the parameters of a row by column.
+
+    Args:
+        row: the row.
+        units: units of measurement by column, to which those of the row are added.
+    """
+    cells: dict[str, Any] = {}
     for name, described in row.values.items():
         # The name of a parameter may be that of another column.
         parameter_name = f"parameter {name}" if name in RESERVED_NAMES else name
@@ -375,6 +397,14 @@ def _make_cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
                 value = sys.intern(value)  # equal texts of many rows share their memory
             cells[column] = value
     return cells
+
+
+def _find_row_label(row: Row) -> str:
+    """Return the label of a row, or a text for one that has none."""
+    if row.label:
+        return row.label
+    # If the prediction was evaluated, the output of the model was NaN or infinite.
+    return "" if row.correct is None else NOT_A_NUMBER
 
 
 def _to_categories(column: pd.Series) -> pd.Categorical:

@@ -11,6 +11,7 @@ import logging
 import threading
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from queue import Full, Queue
 from typing import Any
@@ -27,6 +28,7 @@ MAX_CLOSE_SECONDS = 10.0
 # Maximum number of messages that wait to be sent. Further ones are dropped.
 MAX_QUEUED = 10_000
 MAX_TEXT_LENGTH = 250
+MAX_REASON_LENGTH = 300  # characters of an error in the log
 _LOG = logging.getLogger("advsearch")
 
 
@@ -73,11 +75,7 @@ class Tracker:
         self._n_correct = Counter[str]()
         self._n_judged = Counter[str]()
         self._queue: Queue[tuple[MetricValues, int] | None] = Queue(MAX_QUEUED)
-        setting_texts = {
-            key: str(value)[:MAX_TEXT_LENGTH]
-            for key, value in settings.items()
-            if value is not None
-        }
+        setting_texts = _shorten_settings(settings)
         self._thread = threading.Thread(
             target=self._work, args=(folder, setting_texts), name=name, daemon=True
         )
@@ -149,16 +147,22 @@ class Tracker:
                 message = self._queue.get()
             close()
         except Exception as error:  # whatever a tracker does, the run goes on
-            _LOG.warning(
-                "nothing more is sent to %s: %s",
-                self._name,
-                str(error)[:300] or type(error).__name__,
-            )
+            reason = str(error)[:MAX_REASON_LENGTH] or type(error).__name__
+            _LOG.warning("nothing more is sent to %s: %s", self._name, reason)
+
+
+def _shorten_settings(settings: JsonObject) -> dict[str, str]:
+    """Return settings as texts of at most `MAX_TEXT_LENGTH` characters, without None."""
+    return {
+        key: str(value)[:MAX_TEXT_LENGTH]
+        for key, value in settings.items()
+        if value is not None
+    }
 
 
 def _open_tracker(
     name: str, folder: Path, settings: Mapping[str, str]
-) -> tuple[Callable[[MetricValues, int], object], Callable[[], object]]:
+) -> tuple[LogMetrics, Callable[[], object]]:
     """Open a run of a tracker.
 
     Args:
@@ -174,37 +178,42 @@ def _open_tracker(
     if name == "mlflow":
         package.start_run(run_name=folder.name, nested=True)
         package.log_params(settings)
-
-        def log_metrics(numbers: MetricValues, step: int) -> None:
-            package.log_metrics(dict(numbers), step=step)
-
-        return log_metrics, package.end_run
+        return partial(_log_to_mlflow, package), package.end_run
     # The settings are not sent to TensorBoard: its files are in the folder of the run,
     # where run.yaml has them.
     if name == "tensorboard":
         writer = package.Writer(str(folder / "artifacts" / "tensorboard"))
-
-        def add_scalars(numbers: MetricValues, step: int) -> None:
-            for metric, value in numbers.items():
-                writer.add_scalar(metric, value, step)
-
-        return add_scalars, writer.close
+        return partial(_log_to_tensorboard, writer), writer.close
     run = package.init(
         project="advsearch",
         name=folder.name,
         config=dict(settings),
         reinit="create_new",
     )
+    return partial(_log_to_wandb, run), run.finish
 
-    def log(numbers: MetricValues, step: int) -> None:
-        # The step of wandb itself may never decrease, but the steps of each kind of
-        # rows begin at 0. So the step is sent as a metric of its own, such as
-        # "search/step" with the metric "search/margin".
-        first_metric = next(iter(numbers), "rows/")  # "rows/" if there are no metrics
-        kind = first_metric.partition("/")[0]
-        run.log({**numbers, f"{kind}/step": step})
 
-    return log, run.finish
+def _log_to_mlflow(package: Any, numbers: MetricValues, step: int) -> None:
+    """Send metrics with their step to MLflow; `package` is its module."""
+    package.log_metrics(dict(numbers), step=step)
+
+
+def _log_to_tensorboard(writer: Any, numbers: MetricValues, step: int) -> None:
+    """Send metrics with their step to TensorBoard, by its writer."""
+    for metric, value in numbers.items():
+        writer.add_scalar(metric, value, step)
+
+
+def _log_to_wandb(run: Any, numbers: MetricValues, step: int) -> None:
+    """Send metrics with their step to Weights & Biases, into one of its runs."""
+    # The step of wandb itself may never decrease, but the steps of each kind of
+    # rows begin at 0. So the step is sent as a metric of its own, such as
+    # "search/step" with the metric "search/margin".
+    first_metric = next(iter(numbers), "rows/")  # "rows/" if there are no metrics
+    kind = first_metric.partition("/")[0]
+    run.log({**numbers, f"{kind}/step": step})
 
 
 MetricValues = Mapping[str, float]
+# sends metrics by name with their step
+LogMetrics = Callable[[MetricValues, int], object]

@@ -75,43 +75,86 @@ def find_twin_evidence(
     """
     if run is None:
         return None
-    result = read_twins(run)
-    table: Sequence[TwinAgreement] = getattr(result, "table", ())
-    rows = [row for row in table if row.surroundings != WITHOUT_OBJECT]
-    if not rows:
-        return _make_empty(run, TwinMatch.NOTHING)
-    rows = [row for row in rows if _name_model(row.model) == _name_model(model)]
-    if not rows:
-        return _make_empty(run, TwinMatch.OTHER_MODEL)
-    rows = [row for row in rows if row.task == task]
-    if not rows:
-        return _make_empty(run, TwinMatch.OTHER_TASK)
+    rows = _read_rows_with_object(run)
+    model_name = _name_model(model)
+    rows_of_model = [row for row in rows if _name_model(row.model) == model_name]
+    rows_of_task = [row for row in rows_of_model if row.task == task]
+    if not rows_of_task:
+        return _make_empty(run, _explain_no_row(rows, rows_of_model))
     surroundings = IN_PHOTOGRAPH if in_photograph else environment
     object_stem = PurePath(object_name).stem
-
-    def rank(row: TwinAgreement) -> tuple[bool, ...]:
-        """Return how similar the conditions of a row are, as a key for sorting.
-
-        The first entry counts most: the same object, all objects together, the same
-        surroundings, and any environment rather than a photograph.
-        """
-        is_of_all_objects = not row.object
-        return (
-            row.object == object_stem,
-            is_of_all_objects,
-            row.surroundings == surroundings,
-            row.surroundings != IN_PHOTOGRAPH,
-        )
-
-    # A row with a condition is about a part of the photographs. For each model and task
-    # the table also has rows without one, about all of them.
-    row = max((row for row in rows if not row.condition), key=rank)
+    row = _select_most_similar(rows_of_task, object_stem, surroundings)
     return TwinEvidence(
         run=run,
         match=TwinMatch.MEASURED,
         same_object=row.object == object_stem,
         same_surroundings=row.surroundings == surroundings,
         row=row,
+    )
+
+
+def _read_rows_with_object(run: str) -> list[TwinAgreement]:
+    """Return the rows with the object in view of the table of a run of twins.
+
+    Args:
+        run: name or folder of the run.
+    """
+    table: Sequence[TwinAgreement] = getattr(read_twins(run), "table", ())
+    return [row for row in table if row.surroundings != WITHOUT_OBJECT]
+
+
+def _select_most_similar(
+    rows: Sequence[TwinAgreement], object_stem: str, surroundings: str
+) -> TwinAgreement:
+    """Return the row whose conditions are most similar to those of another run.
+
+    A row with a condition is about a part of the photographs. For each model and task
+    the table also has rows without one, about all of them; only these are compared.
+
+    Args:
+        rows: rows of one model and one task.
+        object_stem: name of the other run's object.
+        surroundings: environment of the other run, or `IN_PHOTOGRAPH`.
+    """
+    return max(
+        (row for row in rows if not row.condition),
+        key=lambda row: _rank_similarity(row, object_stem, surroundings),
+    )
+
+
+def _explain_no_row(
+    rows: Sequence[TwinAgreement], rows_of_model: Sequence[TwinAgreement]
+) -> TwinMatch:
+    """Return why no row of a run of twins is about the model and the task.
+
+    Args:
+        rows: all rows with the object in view.
+        rows_of_model: those about the model.
+    """
+    if not rows:
+        return TwinMatch.NOTHING
+    return TwinMatch.OTHER_TASK if rows_of_model else TwinMatch.OTHER_MODEL
+
+
+def _rank_similarity(
+    row: TwinAgreement, object_stem: str, surroundings: str
+) -> tuple[bool, ...]:
+    """Return how similar the conditions of a row are, as a key for sorting.
+
+    The first entry counts most: the same object, all objects together, the same
+    surroundings, and any environment rather than a photograph.
+
+    Args:
+        row: row of the table of a run of twins.
+        object_stem: name of the object to compare with.
+        surroundings: environment to compare with, or `IN_PHOTOGRAPH`.
+    """
+    is_of_all_objects = not row.object
+    return (
+        row.object == object_stem,
+        is_of_all_objects,
+        row.surroundings == surroundings,
+        row.surroundings != IN_PHOTOGRAPH,
     )
 
 

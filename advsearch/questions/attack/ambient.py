@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 from torch import Tensor
 
@@ -36,27 +36,65 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
         verifier: verifier of the attack.
         u: (d,) the configuration.
     """
-    problem = verifier.problem
     findings = verifier.run_state
-    scene_lux = _find_scene_lux(problem)
+    scene_lux = _find_scene_lux(verifier.problem)
     if scene_lux is None or findings.verification is None:
         return  # no light of the attack competes with the ambient light
     findings.verification_by_lux[scene_lux] = findings.verification
+    holds = partial(_holds_in_light, verifier, u, scene_lux)
+    holding_lux, failing_lux = _double_until_failing(holds, scene_lux)
+    holds_in_direct_sun = failing_lux not in findings.verification_by_lux
+    if not holds_in_direct_sun:  # else the failing light was not tried
+        _bisect_ambient(holds, holding_lux, failing_lux)
 
-    def holds(lux: float) -> bool:
-        """Verify the configuration in an ambient light, and store the result."""
-        verification = _verify_in_light(verifier, u, lux=lux, factor=lux / scene_lux)
-        findings.verification_by_lux[lux] = verification
-        return verification.ending is Ending.FOUND
 
+def _holds_in_light(
+    verifier: Verifier, u: Tensor, scene_lux: float, lux: float
+) -> bool:
+    """Verify a configuration in an ambient light, and store the result.
+
+    Args:
+        verifier: verifier of the attack.
+        u: (d,) the configuration.
+        scene_lux: the ambient light of the scene.
+        lux: the ambient light to try.
+    """
+    verification = _verify_in_light(verifier, u, lux=lux, factor=lux / scene_lux)
+    verifier.run_state.verification_by_lux[lux] = verification
+    return verification.ending is Ending.FOUND
+
+
+def _double_until_failing(
+    holds: Callable[[float], bool], scene_lux: float
+) -> tuple[float, float]:
+    """Double the ambient light until a configuration fails or `MAX_LUX` is exceeded.
+
+    Args:
+        holds: tries the configuration in an ambient light, in lux.
+        scene_lux: the ambient light of the scene, in which it holds.
+
+    Returns:
+        The brightest light in which it holds, and twice that light. In the latter it
+        fails, unless that is beyond `MAX_LUX` and was not tried.
+    """
     holding_lux = scene_lux
     failing_lux = 2.0 * scene_lux
     while failing_lux <= MAX_LUX and holds(failing_lux):
         holding_lux = failing_lux
         failing_lux = 2.0 * failing_lux
-    holds_in_direct_sun = failing_lux not in findings.verification_by_lux
-    if holds_in_direct_sun:  # the next light is beyond `MAX_LUX`, and was not tried
-        return
+    return holding_lux, failing_lux
+
+
+def _bisect_ambient(
+    holds: Callable[[float], bool], holding_lux: float, failing_lux: float
+) -> None:
+    """Try ambient lights between one in which a configuration holds and one in which not.
+
+    Args:
+        holds: tries the configuration in an ambient light, in lux, and stores the result.
+        holding_lux: ambient light in which it holds.
+        failing_lux: brighter ambient light in which it fails.
+    """
     for _ in range(N_BISECTIONS):
         # halfway on a logarithmic scale
         middle_lux = (holding_lux * failing_lux) ** 0.5
@@ -78,31 +116,41 @@ def _verify_in_light(
         factor: the ambient light as a multiple of the scene's.
     """
     problem = verifier.problem
-    # trials of the clean scene, and as many of the configuration
-    n_renders = 2 * verifier.n_trials
-    title = f"trying it in ambient light of {lux:.3g} lux"
-    verifier.begin_stage(title, n_renders, name="ambient", at_most=True)
-    # Workers make the problem in that light from its key, see `make_problem_finder`.
-    problem_key = factor
-    evaluator = ParallelEvaluator(
-        with_ambient_light(problem, factor),
-        verifier.journal.evaluator.workers,
-        problem_key,
-    )
-    journal = replace(verifier.journal, evaluator=evaluator)
-    verifier_in_light = replace(verifier, journal=journal)
+    verifier_in_light = _move_into_light(verifier, lux, factor)
+    seed = seeds.derive_seed(problem.seed, "ambient")  # the same in every light
     return verify(
         verifier_in_light.evaluate_all,
         problem.domain,
         u,
         claim=Ending.FOUND,
         spp=verifier.run_state.spp,
-        seed=seeds.derive_seed(problem.seed, "ambient"),
+        seed=seed,
         trials=verifier.look_sizes,
         rule=problem.verification_rule,
         kind=f"ambient {lux:.6g} lux",
         control_kind=f"control {lux:.6g} lux",
     )
+
+
+def _move_into_light(verifier: Verifier, lux: float, factor: float) -> Verifier:
+    """Begin a stage, and return a verifier that renders the scene in an ambient light.
+
+    Args:
+        verifier: verifier of the attack.
+        lux: the ambient light.
+        factor: the ambient light as a multiple of the scene's.
+    """
+    # trials of the clean scene, and as many of the configuration
+    n_renders = 2 * verifier.n_trials
+    title = f"trying it in ambient light of {lux:.3g} lux"
+    verifier.begin_stage(title, n_renders, name="ambient", at_most=True)
+    # Workers make the problem in that light from its key, see `make_problem_finder`.
+    problem_key = factor
+    workers = verifier.journal.evaluator.workers
+    problem_in_light = with_ambient_light(verifier.problem, factor)
+    evaluator = ParallelEvaluator(problem_in_light, workers, problem_key)
+    journal = replace(verifier.journal, evaluator=evaluator)
+    return replace(verifier, journal=journal)
 
 
 def _find_scene_lux(problem: Problem) -> float | None:

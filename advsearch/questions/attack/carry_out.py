@@ -7,7 +7,7 @@ Experiments that render and evaluate single configurations, without a search, be
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -20,6 +20,7 @@ from advsearch import seeds
 from advsearch.attacks import Policy, make_policy
 from advsearch.attacks.objectives import (
     OBJECTIVE_KINDS,
+    Objective,
     check_objective,
     list_requested_inputs,
 )
@@ -27,7 +28,7 @@ from advsearch.attacks.policies import POLICIES
 from advsearch.cluster import BatchFunction, Workers, WorkerTask
 from advsearch.cluster.workers import open_workers
 from advsearch.config import SceneConfig, has_model_url, make_single_value_error
-from advsearch.controls import make_space
+from advsearch.controls import Space, make_space
 from advsearch.controls.base import Control, describe_adjusted_defaults
 from advsearch.controls.ranges import has_distribution
 from advsearch.engine import judging, loading, naming
@@ -70,6 +71,7 @@ from advsearch.scene.photograph_files import (
     is_photograph_folder,
     read_photograph_folder,
 )
+from advsearch.scene.renderer import Renderer
 from advsearch.scene.things import ALL_THINGS
 from advsearch.settings import FILES
 from advsearch.tasks import AnyTask, Facts, Task, make_task
@@ -122,6 +124,17 @@ class AttackParts:
     metrics: Metrics = field(default_factory=dict)
     clean_matrix: CleanMatrix = field(default_factory=CleanMatrix)
 
+    @property
+    def all_controls(self) -> tuple[Any, ...]:
+        """The searched controls, then those that vary by chance."""
+        return (*self.controls, *self.random_controls)
+
+    @property
+    def resolution(self) -> tuple[int, int]:
+        """Size of the images: the setting, or what the model takes."""
+        model, _ = self.model_and_warnings
+        return self.config.resolution or model.input_size
+
 
 def load_parts(
     config: AttackConfig, scene: Scene | None = None, model: Model | None = None
@@ -144,23 +157,27 @@ def load_parts(
     policy = make_policy(config.policy_name, **config.policy_options)
     is_step_of_experiment = scene is not None and model is not None
     is_stored = not is_step_of_experiment
-    scene = scene or naming.load_configured_scene(config)
-    warnings: list[str] = []
-    if model is None:
-        model, warnings = load_ensemble(config.model, config, task)
-    metrics = judging.load_metrics(config.metrics) if is_stored else {}
     return AttackParts(
         config=config,
-        scene=scene,
-        model_and_warnings=(model, warnings),
+        scene=scene or naming.load_configured_scene(config),
+        model_and_warnings=_load_missing_model(model, config, task),
         task=task,
         controls=searched,
         random_controls=random_controls,
         objective=objective,
         policy=policy,
         is_stored=is_stored,
-        metrics=metrics,
+        metrics=judging.load_metrics(config.metrics) if is_stored else {},
     )
+
+
+def _load_missing_model(
+    model: Model | None, config: AttackConfig, task: Task
+) -> tuple[Model, list[str]]:
+    """Return a model, or load the one of the settings for None, with its warnings."""
+    if model is not None:
+        return model, []
+    return load_ensemble(config.model, config, task)
 
 
 def load_parts_of_run(run: Path) -> AttackParts:
@@ -218,6 +235,27 @@ def move_to_photographs(
             "scene"
         )
     used_photographs = list_used_photographs(parts.scene.description)
+    # by the name of the photograph's file
+    parts_in_unused: dict[str, AttackParts] = {}
+    parts_in_used: dict[str, AttackParts] = {}
+    for name, description in photographs.scenes.items():
+        is_used = bool(used_photographs & list_used_photographs(description))
+        parts_by_name = parts_in_used if is_used else parts_in_unused
+        scene_in_photograph = replace(scene, description=description)
+        parts_by_name[name] = _replace_scene(parts, config, scene_in_photograph)
+    return parts_in_unused, parts_in_used
+
+
+def _replace_scene(
+    parts: AttackParts, config: AttackConfig, scene: Scene
+) -> AttackParts:
+    """Return the parts of an attack with its scene in a photograph.
+
+    Args:
+        parts: parts of the attack.
+        config: settings with the photograph.
+        scene: the scene in the photograph.
+    """
     # The control of the kind "backdrop" chooses a photograph by chance. Here each scene
     # is rendered into a single one.
     random_controls = tuple(
@@ -225,19 +263,13 @@ def move_to_photographs(
         for control in parts.random_controls
         if not control.photograph_refusal and control.kind != "backdrop"
     )
-    parts_in_unused: dict[str, AttackParts] = {}
-    parts_in_used: dict[str, AttackParts] = {}
-    for name, description in photographs.scenes.items():
-        is_used = bool(used_photographs & list_used_photographs(description))
-        parts_by_name = parts_in_used if is_used else parts_in_unused
-        parts_by_name[name] = replace(
-            parts,
-            config=config,
-            scene=replace(scene, description=description),
-            random_controls=random_controls,
-            clean_matrix=CleanMatrix(),  # not shared: each has another clean scene
-        )
-    return parts_in_unused, parts_in_used
+    return replace(
+        parts,
+        config=config,
+        scene=scene,
+        random_controls=random_controls,
+        clean_matrix=CleanMatrix(),  # not shared: each has another clean scene
+    )
 
 
 def _set_photograph_folder(config: AttackConfig, folder: str) -> AttackConfig:
@@ -253,24 +285,33 @@ def _set_photograph_folder(config: AttackConfig, folder: str) -> AttackConfig:
         FileFormatError: the folder cannot be used.
         InputError: the folder has no photographs with camera files.
     """
-    if not is_photograph_folder(folder):
-        raise InputError(
-            f"backdrop: expected a folder of photographs with their camera files, got "
-            f"{folder}"
-        )
+    _check_photograph_folder(folder)
     # all photographs of a folder have the same kinds of camera files
     view = next(iter(read_photograph_folder(folder).values()))
-    replaced_prefixes = view.replaced_settings  # such as ("camera.", "pose.")
-    other_settings = {
-        name: value
-        for name, value in config.set_.items()
-        if not name.startswith(replaced_prefixes)
-    }
+    other_settings = _drop_settings(config.set_, view.replaced_settings)
     # A camera file may state the occluder and the lens of its photograph.
     changes = {"backdrop": folder, "occluder": None, "set_": other_settings}
     if view.camera is not None:
         changes["camera"] = None
     return config.model_copy(update=changes)
+
+
+def _check_photograph_folder(folder: str) -> None:
+    """Raise an error if a folder has no photographs with their camera files."""
+    if not is_photograph_folder(folder):
+        raise InputError(
+            f"backdrop: expected a folder of photographs with their camera files, got "
+            f"{folder}"
+        )
+
+
+def _drop_settings(
+    settings: Mapping[str, Any], prefixes: tuple[str, ...]
+) -> dict[str, Any]:
+    """Return the settings whose names begin with no prefix, such as "camera."."""
+    return {
+        name: value for name, value in settings.items() if not name.startswith(prefixes)
+    }
 
 
 def list_used_photographs(description: SceneDescription) -> set[str]:
@@ -302,14 +343,19 @@ def make_attack_controls(
     naming.check_run_settings(config)
     controls = naming.make_configured_controls(config, searched)
     for control in controls:
-        for name, spec in getattr(control, "specs", {}).items():
-            if has_distribution(spec):
-                raise InputError(
-                    f"`controls` {control.name}.{name}: expected values to search, got "
-                    "a probability distribution; give a range, or put the control into "
-                    "`over`, where it varies by chance"
-                )
+        _check_no_distribution(control)
     return controls, naming.make_configured_controls(config, random, are_searched=False)
+
+
+def _check_no_distribution(control: Control) -> None:
+    """Raise an error if a searched control has a distribution instead of a range."""
+    for name, spec in getattr(control, "specs", {}).items():
+        if has_distribution(spec):
+            raise InputError(
+                f"`controls` {control.name}.{name}: expected values to search, got "
+                "a probability distribution; give a range, or put the control into "
+                "`over`, where it varies by chance"
+            )
 
 
 def make_task_and_objective(
@@ -367,13 +413,10 @@ def check_from_config(config: AttackConfig) -> None:
             other, or give a result that cannot be evaluated.
     """
     parts = load_parts(config)
-    model, _ = parts.model_and_warnings
     # Both calls raise an error if something does not fit; their results are not used.
     _bind_task(parts, is_calibrated=False)
-    size = config.resolution or model.input_size
     make_space(
-        (*parts.controls, *parts.random_controls),
-        fit_camera(parts.scene.description, size),
+        parts.all_controls, fit_camera(parts.scene.description, parts.resolution)
     )
 
 
@@ -412,10 +455,8 @@ def make_problem_with_warnings(
         model, warnings = load_ensemble(config.model, config, parts.task)
     changed_parts = replace(parts, config=config, model_and_warnings=(model, warnings))
     problem = make_problem(changed_parts)
-    return problem, [
-        *warnings,
-        *describe_adjusted_defaults(problem.space.adjusted_defaults),
-    ]
+    adjusted = describe_adjusted_defaults(problem.space.adjusted_defaults)
+    return problem, [*warnings, *adjusted]
 
 
 def make_problem_on(
@@ -445,29 +486,12 @@ def make_problem(parts: AttackParts, *, differentiated: bool = True) -> Problem:
         InputError: the parts do not fit together.
     """
     config = parts.config
-    model, warnings = parts.model_and_warnings
+    model, _ = parts.model_and_warnings
     task, make_scene_facts = _bind_task(parts)
-    resolution = config.resolution or model.input_size
-    description = fit_camera(parts.scene.description, resolution)
-    space = make_space((*parts.controls, *parts.random_controls), description)
-    omissions = ALL_OMISSIONS if config.specialise else NO_OMISSIONS
-    renderer = loading.make_renderer(
-        description,
-        space,
-        resolution,
-        denoise=config.denoise,
-        seed=config.seed,
-        estimators=config.estimators,
-        leave_out=omissions,
-        sampler=config.pixel_sampler,
-        differentiated=differentiated,
-    )
-    features_seed = seeds.derive_seed(config.seed, "clean features")
-    objective, note = judging.make_objective(
-        parts.objective, task, model, renderer, features_seed, config.ensemble
-    )
-    if note:
-        warnings.append(note)
+    description = fit_camera(parts.scene.description, parts.resolution)
+    space = make_space(parts.all_controls, description)
+    renderer = _make_attack_renderer(parts, description, space, differentiated)
+    objective = _make_attack_objective(parts, task, renderer)
     _check_printable(parts, config, description)
     problem = Problem(
         renderer=renderer,
@@ -482,13 +506,71 @@ def make_problem(parts: AttackParts, *, differentiated: bool = True) -> Problem:
         aovs=parse_aovs(config.aov),
         metrics=parts.metrics,
     )
-    if config.specialise:
+    _prepare_search(parts, problem)
+    return problem
+
+
+def _make_attack_renderer(
+    parts: AttackParts,
+    description: SceneDescription,
+    space: Space,
+    differentiated: bool,
+) -> Renderer:
+    """Make the renderer of an attack.
+
+    Args:
+        parts: the parts of the attack.
+        description: the scene, with its camera fitted to the size of the images.
+        space: space of all controls of the attack.
+        differentiated: whether derivatives are needed.
+    """
+    config = parts.config
+    return loading.make_renderer(
+        description,
+        space,
+        parts.resolution,
+        denoise=config.denoise,
+        seed=config.seed,
+        estimators=config.estimators,
+        leave_out=ALL_OMISSIONS if config.specialise else NO_OMISSIONS,
+        sampler=config.pixel_sampler,
+        differentiated=differentiated,
+    )
+
+
+def _make_attack_objective(
+    parts: AttackParts, task: Task, renderer: Renderer
+) -> Objective:
+    """Make the objective of an attack, and add a remark about it to the warnings.
+
+    Args:
+        parts: the parts of the attack. Their list of warnings gets the remark.
+        task: the task, bound to the model.
+        renderer: renders the clean scene if the objective compares with it.
+    """
+    config = parts.config
+    model, warnings = parts.model_and_warnings
+    features_seed = seeds.derive_seed(config.seed, "clean features")
+    objective, note = judging.make_objective(
+        parts.objective, task, model, renderer, features_seed, config.ensemble
+    )
+    if note:
+        warnings.append(note)
+    return objective
+
+
+def _prepare_search(parts: AttackParts, problem: Problem) -> None:
+    """Set what the search of an attack needs: shared light paths and its size.
+
+    Raises:
+        InputError: the objective requests an input that the problem lacks.
+    """
+    if parts.config.specialise:
         problem.shared_paths = find_shared_paths(problem)
     _check_objective_inputs(parts, problem)
     problem.steps, problem.conditions_per_evaluation = choose_search_size(
-        config, problem
+        parts.config, problem
     )
-    return problem
 
 
 def _check_printable(
@@ -540,32 +622,52 @@ def _bind_task(
         configuration.
     """
     config = parts.config
+    task = _bind_to_model(parts)
+    scene = parts.scene.description
+    make_scene_facts = partial(
+        make_facts, scene, config.object, config.label, judge=config.judge
+    )
+    task = _prepare_bound_task(
+        parts, task, make_scene_facts, is_calibrated=is_calibrated
+    )
+    if config.judge == ALL_THINGS:
+        # every thing in the scene is evaluated, not only the object
+        task = make_each_thing_task(task)
+    return task, make_scene_facts
+
+
+def _bind_to_model(parts: AttackParts) -> Task:
+    """Return the task of an attack for its model, its objective and its target."""
+    config = parts.config
     model, _ = parts.model_and_warnings
     task = parts.task
     if isinstance(parts.objective, str):
         task = task.with_objective(parts.objective)
     task = judging.make_ensemble_task(task, model)
-    task = task.on(model, target=config.target, minimise=config.minimise)
+    return task.on(model, target=config.target, minimise=config.minimise)
 
-    make_scene_facts = partial(
-        make_facts,
-        parts.scene.description,
-        config.object,
-        config.label,
-        judge=config.judge,
-    )
+
+def _prepare_bound_task(
+    parts: AttackParts,
+    task: Task,
+    make_scene_facts: Callable[[DescribeConfiguration], Facts],
+    *,
+    is_calibrated: bool,
+) -> Task:
+    """Check and calibrate a task that is bound to its model, or to those of an ensemble.
+
+    See `_bind_task` for the other arguments.
+
+    Args:
+        task: the task.
+        make_scene_facts: makes the ground truth of a configuration.
+    """
+    model, _ = parts.model_and_warnings
     # the ground truth of the scene as it is, with no value changed
     clean_facts = make_scene_facts(_describe_no_changes)
     if isinstance(task, EnsembleTask):
-        task = _prepare_members(parts, task, clean_facts, is_calibrated=is_calibrated)
-    else:
-        task = _prepare_task(
-            parts, task, model, clean_facts, is_calibrated=is_calibrated
-        )
-    if config.judge == ALL_THINGS:
-        # every thing in the scene is evaluated, not only the object
-        task = make_each_thing_task(task)
-    return task, make_scene_facts
+        return _prepare_members(parts, task, clean_facts, is_calibrated=is_calibrated)
+    return _prepare_task(parts, task, model, clean_facts, is_calibrated=is_calibrated)
 
 
 def _describe_no_changes() -> dict[str, Value]:
@@ -580,16 +682,12 @@ def _prepare_members(
 
     See `_prepare_task` for the arguments.
     """
-    members = [
-        _prepare_task(
-            parts,
-            member,
-            model,
-            task.select_facts(member, clean_facts),
-            is_calibrated=is_calibrated,
+    members = []
+    for member, model in zip(task.tasks, task.models, strict=True):
+        facts = task.select_facts(member, clean_facts)
+        members.append(
+            _prepare_task(parts, member, model, facts, is_calibrated=is_calibrated)
         )
-        for member, model in zip(task.tasks, task.models, strict=True)
-    ]
     return replace(task, tasks=tuple(members))
 
 
@@ -623,9 +721,10 @@ def _choose_default_size(
         problem: problem of the attack.
         n_random_numbers: how many numbers vary by chance.
     """
-    size_if_predicted = SIZE_OVER_PREDICTED
-    if n_random_numbers == 1:
-        size_if_predicted = SIZE_OVER_SINGLE_PARAMETER
+    varies_single_number = n_random_numbers == 1
+    size_if_predicted = (
+        SIZE_OVER_SINGLE_PARAMETER if varies_single_number else SIZE_OVER_PREDICTED
+    )
     # Preparing a matrix costs more than it saves if there are few steps. So whether
     # images are predicted depends on the number of steps.
     steps_if_predicted, _ = size_if_predicted
@@ -698,17 +797,23 @@ def _prepare_task(
     config = parts.config
     judging.check_truth(task, model, parts.scene, clean_facts, config.image_settings)
     if is_calibrated:
-        task = judging.calibrate_task(
-            task,
-            model,
-            scenes=[parts.scene],
-            label=config.label,
-            judge=config.judge,
-            image_settings=config.image_settings,
-        )
+        task = _calibrate_on_scene(parts, task, model)
     _, warnings = parts.model_and_warnings  # the list itself, which is changed
     warnings += [remark for remark in task.output_remarks if remark not in warnings]
     return task
+
+
+def _calibrate_on_scene(parts: AttackParts, task: Task, model: Model) -> Task:
+    """Return the task of a model, calibrated on the scene of an attack."""
+    config = parts.config
+    return judging.calibrate_task(
+        task,
+        model,
+        scenes=[parts.scene],
+        label=config.label,
+        judge=config.judge,
+        image_settings=config.image_settings,
+    )
 
 
 def open_executor(
@@ -728,15 +833,7 @@ def open_executor(
         InputError: workers are requested for a model behind an address. Only a single
             process may call it, because it counts the calls.
     """
-    # A worker gets the settings of the run, but must not start workers itself.
-    in_process = {"workers": None, "cluster": None}
-    worker_settings = config.make_repeatable().model_copy(update=in_process).to_json()
-    work = WorkerTask(
-        function,
-        worker_settings,
-        path_setting_names=FILES,
-        threads=config.n_used_threads or 1,
-    )
+    work = _make_worker_task(config, function)
     # not every experiment has these two settings
     workers = getattr(config, "workers", None)
     cluster = getattr(config, "cluster", None)
@@ -748,4 +845,22 @@ def open_executor(
         )
     return open_workers(
         work, workers=workers, cluster=cluster, report_message=progress.message
+    )
+
+
+def _make_worker_task(config: SceneConfig, function: str) -> WorkerTask:
+    """Return how workers make their work from the settings of a run.
+
+    Args:
+        config: the settings.
+        function: path "module:function" of the function that makes a worker's work.
+    """
+    # A worker gets the settings of the run, but must not start workers itself.
+    in_process = {"workers": None, "cluster": None}
+    worker_settings = config.make_repeatable().model_copy(update=in_process).to_json()
+    return WorkerTask(
+        function,
+        worker_settings,
+        path_setting_names=FILES,
+        threads=config.n_used_threads or 1,
     )

@@ -5,11 +5,17 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from torch import Tensor
 
-from advsearch.attacks import Ending, SearchResult, Verification, count_right
+from advsearch.attacks import (
+    Ending,
+    SearchResult,
+    StepRecord,
+    Verification,
+    count_right,
+)
 from advsearch.attacks.candidates import FoundFailure
 from advsearch.attacks.trials import MAX_MOVED_FRACTION, MAX_SAMPLE_RATIO, OVER_LADDER
 from advsearch.engine.journal import Journal
@@ -36,6 +42,7 @@ from advsearch.questions.attack.result import (
 )
 from advsearch.questions.attack.stages import UNPRINTED
 from advsearch.questions.attack.summary import (
+    AlongDrive,
     AmbientLight,
     AmbientPoint,
     AttackSummary,
@@ -81,6 +88,15 @@ from advsearch.viewer.pages import write_result
 
 T = TypeVar("T")
 MAX_LISTED_NUMBERS = 4096  # larger distributions are left out of a summary
+# fields of a summary about the search if there was none
+_EMPTY_SEARCH_FIELDS: Mapping[str, Any] = {
+    "distribution": None,
+    "claimed": None,
+    "gradients": None,
+    "configuration": None,
+    "steps": 0,
+    "non_finite": NotFinite(objectives=0, gradient_elements=0),
+}
 
 
 def make_result(
@@ -116,31 +132,25 @@ def make_result(
             photographs; None without one.
     """
     problem = journal.problem
-    search = findings.search_result
     run = journal.run_directory
     stages.progress.stage("making the pictures and the report")
-    u = problem.domain.start  # without a search, the adversarial scene is the clean one
-    if search is not None:
-        u = problem.domain.project(search.best_u)
+    u = _find_adversarial_u(problem, findings)
     scene_images = _render_scenes(problem, findings, u)
     artifacts = problem.searched_space.get_artifact_images(u)
+    run_path = None if run is None else run.path
     if run is not None:
         _write_files(run, problem, findings, u, scene_images, artifacts)
-    drive = None  # the result for both scenes along a path, if one varies by chance
-    if not findings.interrupted:
-        adversarial_u = None if search is None else u
-        drive = evaluate_drive(problem, adversarial_u, findings.spp, run)
     summary = _summarize(
         findings,
         journal,
         scene_images["clean"],
         scene_images["adversarial"],
-        run=None if run is None else str(run.path),
+        drive=_evaluate_finished_drive(problem, findings, u, run),
+        run=None if run_path is None else str(run_path),
         object=object_name,
         judge=judge,
         policy=policy,
         objective=name_objective(problem.task, objective),
-        drive=drive,
         printability=_summarize_printability(problem, findings) if printable else None,
         warnings=[*warnings, *_make_remarks(findings, problem, journal)],
         seconds={**stages.seconds, "total": stages.total_seconds},
@@ -149,20 +159,55 @@ def make_result(
         twins=_find_twins(twins, problem, object_name),
     )
     if run is not None:
-        write_result(run, summary)
-        # An interrupted run may be continued, and then needs what is cached.
-        if not findings.interrupted:
-            run.store.delete_cached()
+        _store_summary(run, summary, is_finished=not findings.interrupted)
     return AttackResult(
         summary=summary,
-        run=None if run is None else run.path,
+        run=run_path,
         u=u,
         clean=scene_images["clean"].image,
         adversarial=scene_images["adversarial"].image,
         artifacts=artifacts,
-        search=search,
+        search=findings.search_result,
         in_memory=tuple(journal.rows),
     )
+
+
+def _find_adversarial_u(problem: Problem, findings: RunState) -> Tensor:
+    """Return the adversarial configuration (d,); without a search the clean one."""
+    search = findings.search_result
+    if search is None:
+        return problem.domain.start
+    return problem.domain.project(search.best_u)
+
+
+def _evaluate_finished_drive(
+    problem: Problem, findings: RunState, u: Tensor, run: RunDirectory | None
+) -> AlongDrive | None:
+    """Evaluate both scenes along a path, unless the attack was interrupted.
+
+    Args:
+        problem: problem of the attack.
+        findings: findings of the attack.
+        u: (d,) the adversarial configuration; not used without a search.
+        run: the run directory, which gets the images; None if nothing is stored.
+
+    Returns:
+        The result; None if no path varies by chance.
+    """
+    if findings.interrupted:
+        return None
+    adversarial_u = None if findings.search_result is None else u
+    return evaluate_drive(problem, adversarial_u, findings.spp, run)
+
+
+def _store_summary(
+    run: RunDirectory, summary: AttackSummary, *, is_finished: bool
+) -> None:
+    """Write the summary and the page of a run; a finished run needs no cache any more."""
+    write_result(run, summary)
+    # An interrupted run may be continued, and then needs what is cached.
+    if is_finished:
+        run.store.delete_cached()
 
 
 def _render_scenes(
@@ -234,10 +279,7 @@ def _write_files(
         artifacts: images that the controls make of `u`, by name, such as the texture.
     """
     save_images(run, problem, findings, images)
-    for number, verification in enumerate(findings.failure_verifications):
-        first_trial = (f"failure {number}", 0)  # the kind and the index of a trial
-        name = _name_failure_image(number)
-        save_trial(run, problem, findings, first_trial, name, verification.u)
+    _save_failure_images(run, problem, findings)
     # an 8-bit PNG, and the same display-referred values in float32
     for name, image in artifacts.items():
         run.save_image(name, image, folder="artifacts")
@@ -246,6 +288,16 @@ def _write_files(
     for name, data in problem.searched_space.get_artifact_files(u).items():
         write_bytes(run.path / "artifacts" / name, data)
     write_configuration(run.path, u.numpy())
+
+
+def _save_failure_images(
+    run: RunDirectory, problem: Problem, findings: RunState
+) -> None:
+    """Save an image of each of the different failures that were tried."""
+    for number, verification in enumerate(findings.failure_verifications):
+        first_trial = (f"failure {number}", 0)  # the kind and the index of a trial
+        name = _name_failure_image(number)
+        save_trial(run, problem, findings, first_trial, name, verification.u)
 
 
 def _summarize(
@@ -265,43 +317,58 @@ def _summarize(
         **fields: the other fields of the summary.
     """
     problem = journal.problem
-    task = problem.task
-    max_depth = problem.renderer.scene.max_depth
     adversarial_prediction = None
     if findings.search_result is not None:
         adversarial_prediction = _make_prediction(
             adversarial.judgement, adversarial.trial
         )
+    shared_work = SharedWork.from_worker_stats(
+        journal.evaluator.worker_stats, journal.machines
+    )
     return AttackSummary(
         **fields,
         **_summarize_controls(problem),
         **_summarize_verification(problem, findings),
         **_summarize_search(problem, findings.search_result),
-        model=problem.model.name,
-        task=task.title,
-        environment=problem.environment,
-        label_set=list(task.truth_names(problem.find_truth())),
-        goal=task.success_description,
-        target=list(task.target_names) or None,
-        image_formation=Formation.from_values(problem.renderer.formation),
-        gradient_plan=problem.summarize_plan(problem.gradient_plan),
-        light_path_segments=PathSegments(
-            search=problem.search_depth or max_depth, verification=max_depth
-        ),
-        ending=_find_ending(problem, findings).value,
+        **_summarize_problem(problem),
+        **_summarize_conclusions(problem, findings),
         clean=_make_clean_prediction(problem, findings, clean),
         adversarial=adversarial_prediction,
-        ambient=_summarize_ambient(findings),
-        average=_summarize_average(findings),
-        smallest=_summarize_bracket(problem, findings),
-        failures=describe_failures(problem, findings),
         transport=findings.transport_summary,
-        shared=SharedWork.from_worker_stats(
-            journal.evaluator.worker_stats, journal.machines
-        ),
+        shared=shared_work,
         renders=_count_renders(findings, problem),
-        seed=problem.seed,
     )
+
+
+def _summarize_problem(problem: Problem) -> dict[str, Any]:
+    """Return the fields of a summary about the model, the task and the renders."""
+    task = problem.task
+    max_depth = problem.renderer.scene.max_depth
+    return {
+        "model": problem.model.name,
+        "task": task.title,
+        "environment": problem.environment,
+        "label_set": list(task.truth_names(problem.find_truth())),
+        "goal": task.success_description,
+        "target": list(task.target_names) or None,
+        "image_formation": Formation.from_values(problem.renderer.formation),
+        "gradient_plan": problem.summarize_plan(problem.gradient_plan),
+        "light_path_segments": PathSegments(
+            search=problem.search_depth or max_depth, verification=max_depth
+        ),
+        "seed": problem.seed,
+    }
+
+
+def _summarize_conclusions(problem: Problem, findings: RunState) -> dict[str, Any]:
+    """Return the fields of a summary about the ending, and what else was measured."""
+    return {
+        "ending": _find_ending(problem, findings).value,
+        "ambient": _summarize_ambient(findings),
+        "average": _summarize_average(findings),
+        "smallest": _summarize_bracket(problem, findings),
+        "failures": describe_failures(problem, findings),
+    }
 
 
 def _summarize_controls(problem: Problem) -> dict[str, Any]:
@@ -309,14 +376,13 @@ def _summarize_controls(problem: Problem) -> dict[str, Any]:
     controls = problem.searched_space.controls
     # The space has the searched controls first, then those that conditions vary.
     random_controls = problem.space.controls[len(controls) :]
+    budgets = {control.name: control.largest_group_budget for control in controls}
+    epsilons = {name: budget.epsilon for name, budget in budgets.items()}
+    norms = {name: budget.norm for name, budget in budgets.items()}
     return {
         "controls": [control.name for control in controls],
-        "epsilon": _unwrap_single(
-            {control.name: control.largest_group_budget.epsilon for control in controls}
-        ),
-        "norm": _unwrap_single(
-            {control.name: control.largest_group_budget.norm for control in controls}
-        ),
+        "epsilon": _unwrap_single(epsilons),
+        "norm": _unwrap_single(norms),
         "over": [control.name for control in random_controls],
         "conditions": _describe_conditions(problem),
     }
@@ -329,7 +395,6 @@ def _summarize_verification(problem: Problem, findings: RunState) -> dict[str, A
     that the random search found.
     """
     verification = findings.verification
-    adversarial_trials = verification.adversarial_trials if verification else ()
     # If the random search found a worse configuration than the policy, `verification`
     # is about that configuration, and `outdone` about the policy's.
     outdone = findings.outdone_verification
@@ -338,15 +403,22 @@ def _summarize_verification(problem: Problem, findings: RunState) -> dict[str, A
         sample_count = VerificationSamples.from_values(findings.sample_count)
     return {
         "verified": _make_rate(verification),
-        "tried_objective": TriedObjective(
-            clean=_compute_objective_values(findings.clean_trials),
-            adversarial=_compute_objective_values(adversarial_trials),
-        ),
+        "tried_objective": _summarize_tried_objective(findings),
         "baseline": _summarize_baseline(problem, findings),
         "adversarial_from": None if outdone is None else "random",
         "policy_verified": _make_rate(outdone),
         "sample_count": sample_count,
     }
+
+
+def _summarize_tried_objective(findings: RunState) -> TriedObjective:
+    """Return the objective over the trials of both scenes."""
+    verification = findings.verification
+    adversarial_trials = verification.adversarial_trials if verification else ()
+    return TriedObjective(
+        clean=_compute_objective_values(findings.clean_trials),
+        adversarial=_compute_objective_values(adversarial_trials),
+    )
 
 
 def _make_rate(verification: Verification | None) -> VerifiedRate | None:
@@ -357,24 +429,18 @@ def _make_rate(verification: Verification | None) -> VerifiedRate | None:
 def _summarize_search(problem: Problem, search: SearchResult | None) -> dict[str, Any]:
     """Return the fields of a summary about the search; empty ones without a search."""
     if search is None:
-        return {
-            "distribution": None,
-            "claimed": None,
-            "gradients": None,
-            "configuration": None,
-            "steps": 0,
-            "non_finite": NotFinite(objectives=0, gradient_elements=0),
-        }
+        return dict(_EMPTY_SEARCH_FIELDS)
+    non_finite = NotFinite(
+        objectives=search.non_finite_objectives,
+        gradient_elements=search.non_finite_elements,
+    )
     return {
         "distribution": _summarize_distribution(problem, search),
         "claimed": _make_search_claim(search),
         "gradients": _summarize_gradients(search),
         "configuration": _describe_configuration(problem, search.best_u),
         "steps": len(search.history),
-        "non_finite": NotFinite(
-            objectives=search.non_finite_objectives,
-            gradient_elements=search.non_finite_elements,
-        ),
+        "non_finite": non_finite,
     }
 
 
@@ -424,8 +490,19 @@ def _make_clean_prediction(
     control_group = None
     if findings.clean_trials:
         control_group = make_control_group(findings.clean_trials, findings.spp)
-    # values of the scene that were outside of a control's range, and were replaced
-    adjusted_values = [
+    # `CleanPrediction` has the fields of `PicturedPrediction` and some more.
+    picture_fields = vars(_make_prediction(picture.judgement, picture.trial))
+    return CleanPrediction(
+        **picture_fields,
+        correct=picture.judgement.right,
+        moved=_list_moved_values(problem),
+        control=control_group,
+    )
+
+
+def _list_moved_values(problem: Problem) -> list[MovedValue]:
+    """Return the scene's values that were outside of a control's range and replaced."""
+    return [
         MovedValue(
             parameter=value.parameter_name,
             unit=value.unit,
@@ -434,14 +511,6 @@ def _make_clean_prediction(
         )
         for value in problem.space.adjusted_defaults
     ]
-    # `CleanPrediction` has the fields of `PicturedPrediction` and some more.
-    picture_fields = vars(_make_prediction(picture.judgement, picture.trial))
-    return CleanPrediction(
-        **picture_fields,
-        correct=picture.judgement.right,
-        moved=adjusted_values,
-        control=control_group,
-    )
 
 
 def _summarize_baseline(problem: Problem, findings: RunState) -> BaselineSearch | None:
@@ -464,24 +533,38 @@ def _summarize_ambient(findings: RunState) -> AmbientLight | None:
     if not findings.verification_by_lux:
         return None
     points = [
-        AmbientPoint(
-            lux=lux,
-            holds=verification.ending is Ending.FOUND,
-            verified=make_verified_rate(verification),
-        )
+        _make_ambient_point(lux, verification)
         for lux, verification in sorted(findings.verification_by_lux.items())
     ]
-    # The first point always holds: it is the scene's own light, in which the scene was
-    # verified. Points count up to the first that does not hold, whatever follows it.
-    n_holding = 0
-    while n_holding < len(points) and points[n_holding].holds:
-        n_holding += 1
+    n_holding = _count_holding(points)
+    holds_in_all = n_holding == len(points)
     return AmbientLight(
         lux=points[0].lux,
         holds_to=points[n_holding - 1].lux,
-        limit_lux=points[n_holding].lux if n_holding < len(points) else None,
+        limit_lux=None if holds_in_all else points[n_holding].lux,
         points=points,
     )
+
+
+def _make_ambient_point(lux: float, verification: Verification) -> AmbientPoint:
+    """Return whether the adversarial scene holds in an ambient light, in lux."""
+    return AmbientPoint(
+        lux=lux,
+        holds=verification.ending is Ending.FOUND,
+        verified=make_verified_rate(verification),
+    )
+
+
+def _count_holding(points: Sequence[AmbientPoint]) -> int:
+    """Count the lights, by rising brightness, before the first that does not hold.
+
+    The first light always holds: it is the scene's own light, in which the scene was
+    verified.
+    """
+    n_holding = 0
+    while n_holding < len(points) and points[n_holding].holds:
+        n_holding += 1
+    return n_holding
 
 
 def _summarize_average(findings: RunState) -> AverageCase | None:
@@ -489,14 +572,9 @@ def _summarize_average(findings: RunState) -> AverageCase | None:
 
     Configurations without the object in view count only if there are no others.
     """
-    if not findings.random_trials:
+    trials = _select_visible(findings.random_trials)
+    if not trials:
         return None
-    visible = [
-        trial
-        for trial in findings.random_trials
-        if trial.prediction.label != OUT_OF_VIEW
-    ]
-    trials = visible or findings.random_trials
     right = count_right(trials, findings.spp)
     # without NaN, which `max` cannot order
     scores = [trial.score for trial in trials if not math.isnan(trial.score)]
@@ -512,6 +590,12 @@ def _summarize_average(findings: RunState) -> AverageCase | None:
     )
 
 
+def _select_visible(trials: Sequence[Judgement]) -> Sequence[Judgement]:
+    """Return the trials with the object in view, or all if there are none."""
+    visible = [trial for trial in trials if trial.prediction.label != OUT_OF_VIEW]
+    return visible or trials
+
+
 def _summarize_bracket(problem: Problem, findings: RunState) -> SmallestEpsilon | None:
     """Return the bounds of the smallest epsilon, by control; None if not searched.
 
@@ -522,26 +606,27 @@ def _summarize_bracket(problem: Problem, findings: RunState) -> SmallestEpsilon 
     bracket = findings.smallest_change_bracket
     if bracket is None:
         return None
-
-    def scale_budgets(factor: float) -> dict[str, float]:
-        """Return the epsilon of each control times a factor."""
-        return {
-            control.name: factor * float(control.largest_group_budget.epsilon or 0.0)
-            for control in problem.searched_space.controls
-        }
-
-    has_found = bracket.u is not None
-    has_failed = bracket.largest_failing_scale > 0.0  # 0 until a search fails
+    passing = failing = None
+    if bracket.u is not None:
+        passing = _scale_budgets(problem, bracket.smallest_passing_scale)
+    if bracket.largest_failing_scale > 0.0:  # 0 until a search fails
+        failing = _scale_budgets(problem, bracket.largest_failing_scale)
     return SmallestEpsilon(
-        epsilon=scale_budgets(bracket.smallest_passing_scale) if has_found else None,
-        not_found_at=scale_budgets(bracket.largest_failing_scale)
-        if has_failed
-        else None,
+        epsilon=passing,
+        not_found_at=failing,
         closed=bracket.is_closed,
         confirmed=bracket.confirmed,
         searches=bracket.searches,
         checks=bracket.n_checks,
     )
+
+
+def _scale_budgets(problem: Problem, factor: float) -> dict[str, float]:
+    """Return the epsilon of each searched control times a factor."""
+    return {
+        control.name: factor * float(control.largest_group_budget.epsilon or 0.0)
+        for control in problem.searched_space.controls
+    }
 
 
 def _make_search_claim(search: SearchResult) -> SearchClaim:
@@ -555,22 +640,25 @@ def _make_search_claim(search: SearchResult) -> SearchClaim:
 
 def _summarize_gradients(search: SearchResult) -> SearchGradients:
     """Return the statistics of the gradients of a search."""
-    norms = [
-        record.gradient_norm
-        for record in search.history
-        if not math.isnan(record.objective)
-    ]
     # the cosine of each gradient with the previous one
     cosines = search.agreement
     median_cosine = statistics.median(cosines) if cosines else None
     return SearchGradients(
         count=search.gradients,
         cosine_with_the_one_before=median_cosine,
-        zero=sum(norm == 0.0 for norm in norms),
+        zero=_count_zero_gradients(search.history),
         cut=search.counts.cut,  # gradients in which single elements were clipped
         shortened=search.counts.shortened,  # gradients whose norm was scaled down
         rejected=search.counts.rejected,  # steps that were undone
     )
+
+
+def _count_zero_gradients(history: Sequence[StepRecord]) -> int:
+    """Count the steps whose gradient is zero, though their objective is a number."""
+    norms = [
+        record.gradient_norm for record in history if not math.isnan(record.objective)
+    ]
+    return sum(norm == 0.0 for norm in norms)
 
 
 def _summarize_distribution(
@@ -679,15 +767,28 @@ def _describe_configuration(problem: Problem, u: Tensor) -> dict[str, FoundValue
     described_values = dict[str, FoundValue]()
     for name, described in problem.describe(problem.domain.project(u)).items():
         clean = _get_value(clean_values, name)
-        low, high = ranges.get(name, (None, None))
-        described_values[name] = FoundValue(
-            value=described["value"],
-            unit=described["unit"],
-            clean=clean if isinstance(clean, (int, float, str)) else None,
-            low=low,
-            high=high,
-        )
+        described_values[name] = _make_found_value(described, clean, ranges.get(name))
     return described_values
+
+
+def _make_found_value(
+    described: Value, clean: Any, bounds: tuple[float, float] | None
+) -> FoundValue:
+    """Return a value of the adversarial configuration, as a summary has it.
+
+    Args:
+        described: the value with its unit.
+        clean: the clean value; dropped unless it is a number or a text.
+        bounds: the range of the parameter; None without one.
+    """
+    low, high = bounds or (None, None)
+    return FoundValue(
+        value=described["value"],
+        unit=described["unit"],
+        clean=clean if isinstance(clean, (int, float, str)) else None,
+        low=low,
+        high=high,
+    )
 
 
 def _describe_ranges(problem: Problem) -> dict[str, tuple[float, float]]:
@@ -697,17 +798,10 @@ def _describe_ranges(problem: Problem) -> dict[str, tuple[float, float]]:
     coordinate 0 to the value at 1. A parameter is left out if these two values are not
     numbers, or not in ascending order.
     """
-    start = problem.domain.start
-    # The searched parameters come first in the space, and the start has their
-    # coordinates only.
-    column_of_number = {
-        group.name: group.begin
-        for group in problem.space.groups
-        if group.size == 1 and group.begin < len(start)
-    }
+    column_of_number = _find_number_columns(problem)
     columns = [*column_of_number.values()]
-    values_at_0 = _describe_with(problem, start, columns, 0.0)
-    values_at_1 = _describe_with(problem, start, columns, 1.0)
+    values_at_0 = _describe_with(problem, columns, coordinate=0.0)
+    values_at_1 = _describe_with(problem, columns, coordinate=1.0)
     ranges = dict[str, tuple[float, float]]()
     for name in column_of_number:
         low = _get_value(values_at_0, name)
@@ -718,18 +812,29 @@ def _describe_ranges(problem: Problem) -> dict[str, tuple[float, float]]:
     return ranges
 
 
+def _find_number_columns(problem: Problem) -> dict[str, int]:
+    """Return the column of each searched parameter that is a single number, by name."""
+    # The searched parameters come first in the space, and the start has their
+    # coordinates only.
+    n_searched = len(problem.domain.start)
+    return {
+        group.name: group.begin
+        for group in problem.space.groups
+        if group.size == 1 and group.begin < n_searched
+    }
+
+
 def _describe_with(
-    problem: Problem, u: Tensor, columns: list[int], coordinate: float
+    problem: Problem, columns: list[int], coordinate: float
 ) -> dict[str, Value]:
-    """Return the values of a configuration with some coordinates replaced.
+    """Return the values of the clean configuration with some coordinates replaced.
 
     Args:
         problem: problem of the attack.
-        u: (d,) the configuration.
         columns: indices of the coordinates to replace.
         coordinate: their new value.
     """
-    changed = u.clone()
+    changed = problem.domain.start.clone()
     changed[columns] = coordinate
     return problem.describe(changed)
 
@@ -750,7 +855,6 @@ def _describe_conditions(problem: Problem) -> dict[str, VariedValue]:
     ranges: dict[str, VariedValue] = {}
     if problem.conditions is None:
         return ranges
-    start = problem.make_full_configuration(problem.domain.start)
     # `problem.domain` has the searched controls only.
     full_domain = make_domain(problem.space.controls)
     # Each parameter has a group in the space and a block in the domain. The group has
@@ -761,17 +865,33 @@ def _describe_conditions(problem: Problem) -> dict[str, VariedValue]:
         is_random = group.begin >= len(problem.domain.start)
         if group.size != 1 or not is_random:
             continue
-        described = list[Value]()
-        for coordinate in _list_described_coordinates(block.n_options):
-            u = start.clone()
-            u[group.begin] = coordinate
-            # None if the control does not describe this parameter
-            value = problem.space.describe(u).get(group.name)
-            if value:
-                described.append(value)
+        described = _describe_along(problem, group.name, group.begin, block.n_options)
         if described:
             ranges[group.name] = _to_range(described, is_choice=bool(block.n_options))
     return ranges
+
+
+def _describe_along(
+    problem: Problem, name: str, column: int, n_options: int
+) -> list[Value]:
+    """Return the values of a parameter over its range; none if it is not described.
+
+    Args:
+        problem: problem of the attack.
+        name: name of the parameter.
+        column: index of its coordinate in a full configuration.
+        n_options: number of options of a choice; 0 for a number.
+    """
+    start = problem.make_full_configuration(problem.domain.start)
+    described = list[Value]()
+    for coordinate in _list_described_coordinates(n_options):
+        u = start.clone()
+        u[column] = coordinate
+        # None if the control does not describe this parameter
+        value = problem.space.describe(u).get(name)
+        if value:
+            described.append(value)
+    return described
 
 
 def _list_described_coordinates(n_options: int) -> list[float]:
@@ -820,43 +940,78 @@ def _count_renders(findings: RunState, problem: Problem) -> dict[str, int]:
         if there was a search without print terms, "unprinted" (its images and
         gradients).
     """
-    predictor = findings.predictor
-    n_conditions = problem.conditions_per_evaluation
     counts = dict.fromkeys(
         ("search", "gradient", "baseline", "verification", "products"), 0
     )
-    counts["verification"] = findings.verification_renders + len(
-        findings.first_look_trials
-    )
-    # Searches by the kind of their queries. `UNPRINTED` is a long text, and its count
-    # has the key "unprinted".
+    n_first_looks = len(findings.first_look_trials)
+    counts["verification"] = findings.verification_renders + n_first_looks
+    for kind, search in _list_searches(findings).items():
+        images = _count_search_images(findings, problem, kind, search)
+        counts["products"] += images.predicted
+        counts |= _count_rendered_by_purpose(kind, images)
+    if findings.predictor:
+        n_rendered_to_prepare = findings.predictor.n_traced
+        counts["search"] += n_rendered_to_prepare
+    return counts
+
+
+def _count_rendered_by_purpose(kind: str, images: SearchImages) -> dict[str, int]:
+    """Return the numbers of rendered images of a search, by the names of their counts.
+
+    Args:
+        kind: kind of the search's queries.
+        images: numbers of its images.
+    """
+    if kind == UNPRINTED:
+        return {"unprinted": images.rendered + images.of_gradients}
+    if kind == "search":
+        return {"search": images.rendered, "gradient": images.of_gradients}
+    return {kind: images.rendered}  # the random search has no gradients
+
+
+def _list_searches(findings: RunState) -> dict[str, SearchResult]:
+    """Return the searches that were made, by the kind of their queries."""
+    # `UNPRINTED` is a long text, and its count has the key "unprinted".
     searches = {
         "search": findings.search_result,
         "baseline": findings.random_search_result,
         UNPRINTED: findings.result_without_print_terms,
     }
-    for kind, search in searches.items():
-        if search is None:
-            continue
-        n_predicted_steps = 0
-        if predictor:
-            n_predicted_steps = predictor.count_predicted(kind, len(search.history))
-        n_predicted = n_predicted_steps * n_conditions
-        n_rendered = search.renders * n_conditions - n_predicted
-        # The gradients of predicted images need no renders. There may be fewer
-        # gradients than predicted images.
-        n_gradients = max(0, search.gradients - n_predicted)
-        counts["products"] += n_predicted
-        if kind == UNPRINTED:
-            counts["unprinted"] = n_rendered + n_gradients
-        else:
-            counts[kind] = n_rendered
-            if kind == "search":  # the random search has no gradients
-                counts["gradient"] += n_gradients
-    if predictor:
-        n_rendered_to_prepare = predictor.n_traced
-        counts["search"] += n_rendered_to_prepare
-    return counts
+    return {kind: search for kind, search in searches.items() if search is not None}
+
+
+class SearchImages(NamedTuple):
+    """How many images of a search were predicted, rendered, or rendered for gradients."""
+
+    predicted: int
+    rendered: int
+    of_gradients: int
+
+
+def _count_search_images(
+    findings: RunState, problem: Problem, kind: str, search: SearchResult
+) -> SearchImages:
+    """Count the images of a search.
+
+    Args:
+        findings: findings of the attack, with the predictor of the images.
+        problem: problem of the attack.
+        kind: kind of the search's queries.
+        search: result of the search.
+    """
+    n_predicted_steps = 0
+    if findings.predictor:
+        n_steps = len(search.history)
+        n_predicted_steps = findings.predictor.count_predicted(kind, n_steps)
+    n_conditions = problem.conditions_per_evaluation
+    n_predicted = n_predicted_steps * n_conditions
+    # The gradients of predicted images need no renders. There may be fewer gradients
+    # than predicted images.
+    return SearchImages(
+        predicted=n_predicted,
+        rendered=search.renders * n_conditions - n_predicted,
+        of_gradients=max(0, search.gradients - n_predicted),
+    )
 
 
 def _make_remarks(findings: RunState, problem: Problem, journal: Journal) -> list[str]:
@@ -876,20 +1031,31 @@ def _make_remarks(findings: RunState, problem: Problem, journal: Journal) -> lis
     if samples is not None and samples.table and not samples.converged:
         has_conditions = problem.conditions is not None
         remarks.append(_make_samples_remark(samples.spp, has_conditions=has_conditions))
+    remarks += _list_non_finite_remarks(findings, problem)
+    return [*remarks, *make_lost_remarks(journal.n_lost), *journal.remarks]
+
+
+def _list_non_finite_remarks(findings: RunState, problem: Problem) -> list[str]:
+    """Return a remark on values of images and gradients that were not finite, if any."""
+    n_non_finite = _count_non_finite(findings, problem)
+    if not n_non_finite:
+        return []
+    return [
+        f"{n_non_finite} values of pictures or gradients were not finite "
+        "and were set to 0."
+    ]
+
+
+def _count_non_finite(findings: RunState, problem: Problem) -> int:
+    """Count the values of images and gradients that were not finite."""
     n_in_searches = sum(
         search.non_finite_elements
         for search in (findings.search_result, findings.random_search_result)
         if search is not None
     )
     # Both counts include those of rendered images of a search. So the larger one is
-    # stated, and not their sum.
-    n_non_finite = max(problem.renderer.n_non_finite, n_in_searches)
-    if n_non_finite:
-        remarks.append(
-            f"{n_non_finite} values of pictures or gradients were not finite "
-            "and were set to 0."
-        )
-    return [*remarks, *make_lost_remarks(journal.n_lost), *journal.remarks]
+    # returned, and not their sum.
+    return max(problem.renderer.n_non_finite, n_in_searches)
 
 
 def _make_samples_remark(spp: int, *, has_conditions: bool) -> str:
@@ -925,30 +1091,44 @@ def describe_failures(problem: Problem, findings: RunState) -> DifferentFailures
     if known is None:
         return None
     verifications = findings.failure_verifications
-    n_tried = len(verifications)  # only the first failures are tried
-    listed = []
-    for number, failure in enumerate(known.examples):
-        verification = verifications[number] if number < n_tried else None
-        listed.append(_describe_failure(problem, failure, number, verification))
+    n_verified = sum(
+        verification.ending is Ending.FOUND for verification in verifications
+    )
     failing_fraction = None
     if known.failure_rate is not None:
         failing_fraction = FailingShare.from_values(known.failure_rate)
-    # A policy may divide the space of some parameters into cells, and count in cells.
-    cell_parameters = [
-        problem.domain.element_names[column] for column in known.cell_parameter_indices
-    ]
+    names = problem.domain.element_names
     return DifferentFailures(
-        over=cell_parameters,
+        # A policy may divide the space of some parameters into cells, and count in cells.
+        over=[names[column] for column in known.cell_parameter_indices],
         found=known.n_failures,
         examined=known.n_visited,
         cells=known.n_cells,
         share=failing_fraction,
-        tried=n_tried,
-        verified=sum(
-            verification.ending is Ending.FOUND for verification in verifications
-        ),
-        listed=listed,
+        tried=len(verifications),
+        verified=n_verified,
+        listed=_list_failures(problem, known.examples, verifications),
     )
+
+
+def _list_failures(
+    problem: Problem,
+    failures: Sequence[FoundFailure],
+    verifications: Sequence[Verification],
+) -> list[DifferentFailure]:
+    """Return the different failures, as a result lists them.
+
+    Args:
+        problem: problem of the attack.
+        failures: the failures that the search found.
+        verifications: verifications of the first ones; only these are tried.
+    """
+    n_tried = len(verifications)
+    listed = []
+    for number, failure in enumerate(failures):
+        verification = verifications[number] if number < n_tried else None
+        listed.append(_describe_failure(problem, failure, number, verification))
+    return listed
 
 
 def _describe_failure(
@@ -969,26 +1149,31 @@ def _describe_failure(
         name: DescribedValue.from_values(value)
         for name, value in problem.describe(failure.u).items()
     }
-    ranges = _describe_failure_ranges(problem, failure)
-    if verification is None:
-        return DifferentFailure(
-            ranges=ranges,
-            configuration=configuration,
-            objective=failure.objective,
-            holds=None,
-            verified=None,
-            picture=None,
-            pictured=None,
-        )
     return DifferentFailure(
-        ranges=ranges,
+        ranges=_describe_failure_ranges(problem, failure),
         configuration=configuration,
         objective=failure.objective,
-        holds=verification.ending is Ending.FOUND,
-        verified=make_verified_rate(verification),
-        picture=f"images/{_name_failure_image(number)}.png",
-        pictured=_make_prediction(verification.adversarial_trials[0], trial=0),
+        **_describe_failure_trials(number, verification),
     )
+
+
+def _describe_failure_trials(
+    number: int, verification: Verification | None
+) -> dict[str, Any]:
+    """Return the fields of a listed failure about its trials; None in all without any.
+
+    Args:
+        number: number in the list.
+        verification: verification of the failure; None if it was not tried.
+    """
+    if verification is None:
+        return dict.fromkeys(("holds", "verified", "picture", "pictured"))
+    return {
+        "holds": verification.ending is Ending.FOUND,
+        "verified": make_verified_rate(verification),
+        "picture": f"images/{_name_failure_image(number)}.png",
+        "pictured": _make_prediction(verification.adversarial_trials[0], trial=0),
+    }
 
 
 def _describe_failure_ranges(
@@ -1004,28 +1189,56 @@ def _describe_failure_ranges(
         problem: problem of the attack.
         failure: failure with the bounds of its ranges by column of u.
     """
-    ranges: dict[str, tuple[float, float] | str] = {}
-    for column, bounds in failure.ranges.items():
-        name = problem.domain.element_names[column]
-        block = problem.domain.find_block(column)
-        values_at_bounds = list[Any]()
-        for bound in bounds:
-            u = failure.u.clone()
-            is_choice = bool(block.n_options)
-            if not is_choice:  # the option of a choice is that of the failure itself
-                u[column] = bound
-            described = problem.describe(u).get(block.name)
-            values_at_bounds.append(bound if described is None else described["value"])
-        option_names = [value for value in values_at_bounds if isinstance(value, str)]
-        if option_names:
-            ranges[name] = option_names[0]
-        elif block.size == 1:
-            ranges[name] = (min(values_at_bounds), max(values_at_bounds))
-        else:
-            # A value describes the full vector, and the bounds are those of one
-            # component, which has no description of its own.
-            ranges[name] = (min(bounds), max(bounds))
-    return ranges
+    return {
+        problem.domain.element_names[column]: _describe_failure_range(
+            problem, failure, column
+        )
+        for column in failure.ranges
+    }
+
+
+def _describe_failure_range(
+    problem: Problem, failure: FoundFailure, column: int
+) -> tuple[float, float] | str:
+    """Return the range of a failure in one coordinate, or the name of its option.
+
+    Args:
+        problem: problem of the attack.
+        failure: failure with the bounds of its ranges by column of u.
+        column: the column.
+    """
+    bounds = failure.ranges[column]
+    values_at_bounds = _describe_bounds(problem, failure, column)
+    option_names = [value for value in values_at_bounds if isinstance(value, str)]
+    if option_names:
+        return option_names[0]
+    if problem.domain.find_block(column).size == 1:
+        return (min(values_at_bounds), max(values_at_bounds))
+    # A value describes the full vector, and the bounds are those of one component, which
+    # has no description of its own.
+    return (min(bounds), max(bounds))
+
+
+def _describe_bounds(problem: Problem, failure: FoundFailure, column: int) -> list[Any]:
+    """Return the values of a parameter at the two bounds of its coordinate.
+
+    A bound itself stands for the value of a parameter that is not described.
+
+    Args:
+        problem: problem of the attack.
+        failure: the failure, whose other coordinates are used.
+        column: the column of the coordinate in u.
+    """
+    block = problem.domain.find_block(column)
+    is_choice = bool(block.n_options)
+    values_at_bounds = list[Any]()
+    for bound in failure.ranges[column]:
+        u = failure.u.clone()
+        if not is_choice:  # the option of a choice is that of the failure itself
+            u[column] = bound
+        described = problem.describe(u).get(block.name)
+        values_at_bounds.append(bound if described is None else described["value"])
+    return values_at_bounds
 
 
 def _name_failure_image(number: int) -> str:

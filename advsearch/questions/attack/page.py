@@ -16,7 +16,11 @@ import numpy as np
 from PIL import Image, ImageSequence
 
 from advsearch.questions.attack import display, wording
-from advsearch.questions.attack.summary import AttackSummary, FoundValue
+from advsearch.questions.attack.summary import (
+    AttackSummary,
+    DifferentFailure,
+    FoundValue,
+)
 from advsearch.report import wording as words
 from advsearch.report.figures import draw_searches
 from advsearch.report.views import Column, Html, Picture, ResultPart
@@ -65,43 +69,75 @@ def make_page(run: Path, result: Result) -> str | None:
     object_file = read_object(run)
     frames = _read_frames(run / directory.IMAGES / "search.gif")
     objectives = _read_objectives(run)
-    method_rows = [[name, text] for name, text in wording.method_texts(result).items()]
     rates_table = view.sections[0]  # the view of an attack begins with the rates
     sections = [
         *_image_parts(run, result, animated=bool(frames)),
         make_object_part(object_file),
-        _changes_part(result),
-        _textures_part(run),
-        *_failures_parts(result),
-        _rates_part(result, rates_table),
-        *display.make_ambient_parts(result),
-        _search_part(result, objectives),
-        ResultPart("How the search worked", rows=method_rows, folded=True),
-        _plan_part(result.gradient_plan),
+        *_result_parts(run, result, rates_table),
+        *_search_parts(result, objectives),
     ]
-    facts = {
-        **view.facts,
-        "time": _time_text(result.seconds),
-        "image formation": words.format_formation(result.image_formation),
-        "environment": result.environment,
-        "seed": str(result.seed),
-    }
-    # the subject of the result in a few names
-    about = [
-        wording.budget_text(result),
-        result.object,
-        result.environment,
-        result.model,
-    ]
+    facts = {**view.facts, **_make_page_facts(result)}
+    about = _list_subjects(result)
     view = replace(view, sections=sections, facts=facts, about=about)
     # script elements with data, which the scripts of the page read
     data = make_object_data(object_file)
     if frames:
-        data = [_frames_data(frames, objectives.get("search", [])), *data]
-    scripts = ["make.js", "attack.js"]
-    if object_file:
-        scripts.append("object.js")
+        search_objectives = objectives.get("search", [])
+        data = [_frames_data(frames, search_objectives), *data]
+    object_scripts = ["object.js"] if object_file else []
+    scripts = ["make.js", "attack.js", *object_scripts]
     return make_view_page(run, result, view, data=data, scripts=scripts)
+
+
+def _result_parts(
+    run: Path, summary: AttackSummary, rates_table: ResultPart
+) -> list[ResultPart]:
+    """Return the sections about what was found: changes, textures, failures, rates.
+
+    Args:
+        run: the run directory.
+        summary: summary of the attack.
+        rates_table: table of the rates without bars.
+    """
+    return [
+        _changes_part(summary),
+        _textures_part(run),
+        *_failures_parts(summary),
+        _rates_part(summary, rates_table),
+        *display.make_ambient_parts(summary),
+    ]
+
+
+def _search_parts(
+    summary: AttackSummary, objectives: Mapping[str, list[float | None]]
+) -> list[ResultPart]:
+    """Return the sections about how the search went; see `_search_part`."""
+    method_rows = [[name, text] for name, text in wording.method_texts(summary).items()]
+    return [
+        _search_part(summary, objectives),
+        ResultPart("How the search worked", rows=method_rows, folded=True),
+        _plan_part(summary.gradient_plan),
+    ]
+
+
+def _make_page_facts(summary: AttackSummary) -> dict[str, str]:
+    """Return the facts that only a page displays, by name."""
+    return {
+        "time": _time_text(summary.seconds),
+        "image formation": words.format_formation(summary.image_formation),
+        "environment": summary.environment,
+        "seed": str(summary.seed),
+    }
+
+
+def _list_subjects(summary: AttackSummary) -> list[str]:
+    """Return the subject of the result in a few names."""
+    return [
+        wording.budget_text(summary),
+        summary.object,
+        summary.environment,
+        summary.model,
+    ]
 
 
 def _read_objectives(run: Path) -> dict[str, list[float | None]]:
@@ -157,48 +193,66 @@ def _image_parts(
         animated: whether there are frames of the search.
     """
     images = run / directory.IMAGES
+    yield _model_input_part(summary)
+    yield ResultPart(live="compare")
+    if (images / f"clean{MARKED}").is_file():
+        yield _marks_part(summary)
+    trial_images = _find_trial_images(images)
+    if trial_images:
+        yield _trials_part(trial_images)
+    if animated:
+        yield ResultPart("The search, step by step", live="search")
+    if summary.drive is not None:
+        yield _drive_part(summary)
+
+
+def _trials_part(trial_images: list[Picture]) -> ResultPart:
+    """Return the section with the images of trials, which is folded."""
+    return ResultPart(
+        "Pictures of the verification",
+        pictures=[trial_images],
+        layout="small",
+        folded=True,
+    )
+
+
+def _model_input_part(summary: AttackSummary) -> ResultPart:
+    """Return the section with the images of both scenes and their difference."""
     caption = f"{files.DIFFERENCE_GAIN:g} times magnified, grey where nothing changed"
     difference = Picture("images/difference.png", caption, "Difference")
-    yield ResultPart(
+    return ResultPart(
         "What the model sees",
         pictures=[[*_clean_and_adversarial(summary, ".png"), difference]],
         note=_trial_note(summary),
     )
-    yield ResultPart(live="compare")
-    if (images / f"clean{MARKED}").is_file():
-        yield ResultPart(
-            "What it predicts",
-            pictures=[_clean_and_adversarial(summary, MARKED)],
-            layout="large",
-            note=words.get_marks_legend(summary.task),
-        )
-    trial_images = _find_trial_images(images)
-    if trial_images:
-        yield ResultPart(
-            "Pictures of the verification",
-            pictures=[trial_images],
-            layout="small",
-            folded=True,
-        )
-    if animated:
-        yield ResultPart("The search, step by step", live="search")
-    if summary.drive is not None:
-        caption = "from the first frame to the last"
-        strips = [
-            Picture("images/drive-clean.png", caption, "Clean"),
-            Picture("images/drive.png", caption, "Adversarial"),
-        ]
-        note = f"The model is {wording.drive_text(summary)}."
-        yield ResultPart("Along the drive", pictures=[strips], layout="rows", note=note)
+
+
+def _marks_part(summary: AttackSummary) -> ResultPart:
+    """Return the section with both images and the marks of their predictions."""
+    return ResultPart(
+        "What it predicts",
+        pictures=[_clean_and_adversarial(summary, MARKED)],
+        layout="large",
+        note=words.get_marks_legend(summary.task),
+    )
+
+
+def _drive_part(summary: AttackSummary) -> ResultPart:
+    """Return the section with the frames of both scenes along a path."""
+    caption = "from the first frame to the last"
+    strips = [
+        Picture("images/drive-clean.png", caption, "Clean"),
+        Picture("images/drive.png", caption, "Adversarial"),
+    ]
+    note = f"The model is {wording.drive_text(summary)}."
+    return ResultPart("Along the drive", pictures=[strips], layout="rows", note=note)
 
 
 def _clean_and_adversarial(summary: AttackSummary, suffix: str) -> list[Picture]:
     """Return the images of both scenes; `suffix` is the end of their file names."""
     pictures = []
-    for name, prediction in (
-        ("clean", summary.clean),
-        ("adversarial", summary.adversarial),
-    ):
+    predictions = {"clean": summary.clean, "adversarial": summary.adversarial}
+    for name, prediction in predictions.items():
         caption = "no prediction recorded"
         if prediction is not None:
             caption = words.format_prediction(summary.task, prediction)
@@ -240,22 +294,11 @@ def _changes_part(summary: AttackSummary) -> ResultPart:
     A column that is empty in all rows is left out. Bars of the ranges are drawn only if
     no column is left out.
     """
-    rows = []
-    bars = []
-    for name, changed in (summary.configuration or {}).items():
-        clean = "" if changed.clean is None else format_number(changed.clean)
-        values = changed.value if isinstance(changed.value, list) else [changed.value]
-        # the unit of a discrete choice is "name"
-        has_unit = changed.unit not in (*words.PLAIN_UNITS, "name")
-        unit = f" {changed.unit}" if has_unit else ""
-        adversarial = ", ".join(map(format_number, values)) + unit
-        rows.append([name, clean, adversarial, _range_text(changed)])
-        bars.append(_range_bar(changed))
+    changes = (summary.configuration or {}).items()
+    rows = [_make_change_row(name, changed) for name, changed in changes]
+    bars = [_range_bar(changed) for _, changed in changes]
     heads = ("parameter", "clean", "adversarial", "in its range")
-    # indices of the columns with any text
-    columns = [
-        column for column in range(len(heads)) if any(row[column] for row in rows)
-    ]
+    columns = _find_filled_columns(rows, len(heads))
     has_all_columns = len(columns) == len(heads)
     return ResultPart(
         "What was changed" if rows else "",
@@ -263,6 +306,22 @@ def _changes_part(summary: AttackSummary) -> ResultPart:
         rows=[[row[column] for column in columns] for row in rows],
         bars=bars if has_all_columns else (),  # type: ignore[arg-type]
     )
+
+
+def _find_filled_columns(rows: Sequence[Sequence[str]], n_columns: int) -> list[int]:
+    """Return the indices of the columns of a table that have any text."""
+    return [column for column in range(n_columns) if any(row[column] for row in rows)]
+
+
+def _make_change_row(name: str, changed: FoundValue) -> list[str]:
+    """Return the row of a parameter: its name, both values, and its range."""
+    clean = "" if changed.clean is None else format_number(changed.clean)
+    values = changed.value if isinstance(changed.value, list) else [changed.value]
+    # the unit of a discrete choice is "name"
+    has_unit = changed.unit not in (*words.PLAIN_UNITS, "name")
+    unit = f" {changed.unit}" if has_unit else ""
+    adversarial = ", ".join(map(format_number, values)) + unit
+    return [name, clean, adversarial, _range_text(changed)]
 
 
 def _range_text(changed: FoundValue) -> str:
@@ -305,15 +364,20 @@ def _textures_part(run: Path) -> ResultPart:
         for file in sorted((run / directory.ARTIFACTS).glob("texture*-original.png"))
         if re.fullmatch(r"texture(@[\w-]+)?-original\.png", file.name)
     ]
-    pictures = []
-    for name in originals:
-        adversarial = f"artifacts/{name.removesuffix('-original.png')}.png"
-        caption = f"adversarial texture; {adversarial}"
-        pictures.append(Picture(f"artifacts/{name}", "original texture", "Original"))
-        pictures.append(Picture(adversarial, caption, "Adversarial"))
+    pictures = [picture for name in originals for picture in _texture_pair(name)]
     title = "The textures" if len(originals) > 1 else "The texture"
     picture_rows = [pictures] if pictures else []
     return ResultPart(title, pictures=picture_rows, layout="pair")
+
+
+def _texture_pair(original: str) -> tuple[Picture, Picture]:
+    """Return a texture before and after, by the name of the file before."""
+    adversarial = f"artifacts/{original.removesuffix('-original.png')}.png"
+    caption = f"adversarial texture; {adversarial}"
+    return (
+        Picture(f"artifacts/{original}", "original texture", "Original"),
+        Picture(adversarial, caption, "Adversarial"),
+    )
 
 
 def _failures_parts(summary: AttackSummary) -> Iterator[ResultPart]:
@@ -321,15 +385,11 @@ def _failures_parts(summary: AttackSummary) -> Iterator[ResultPart]:
     known = summary.failures
     if known is None:
         return
-    pictures = []
-    for failure in known.listed:
-        if not failure.picture or not failure.holds:
-            continue
-        prediction = ""
-        if failure.pictured:  # the prediction of this image
-            prediction = words.format_prediction(summary.task, failure.pictured)
-        name = prediction or display.most_frequent_label(failure)
-        pictures.append(Picture(failure.picture, display.range_text(failure), name))
+    pictures = [
+        _make_failure_picture(summary.task, failure, failure.picture)
+        for failure in known.listed
+        if failure.picture and failure.holds
+    ]
     picture_rows = [pictures] if pictures else []
     yield replace(
         display.make_failures_part(known),
@@ -337,6 +397,15 @@ def _failures_parts(summary: AttackSummary) -> Iterator[ResultPart]:
         text=[f"Failures are {display.failures_text(known)}."],
         pictures=picture_rows,
     )
+
+
+def _make_failure_picture(task: str, failure: DifferentFailure, file: str) -> Picture:
+    """Return the image of a failure, named by its prediction, with its ranges."""
+    prediction = ""
+    if failure.pictured:  # the prediction of this image
+        prediction = words.format_prediction(task, failure.pictured)
+    name = prediction or display.most_frequent_label(failure)
+    return Picture(file, display.range_text(failure), name)
 
 
 def _rates_part(summary: AttackSummary, table: ResultPart) -> ResultPart:
@@ -347,36 +416,51 @@ def _rates_part(summary: AttackSummary, table: ResultPart) -> ResultPart:
         table: the same without bars, with the columns name, prediction, number, rate
             and interval.
     """
-    average = summary.average
+    bars = _list_rate_bars(summary)
+    has_rates = any(bars)
+    if not has_rates:
+        return ResultPart()
+    return replace(
+        table,
+        title="Verified rates",
+        column_heads=_put_rate_first(table.column_heads),
+        rows=[_put_rate_first(row) for row in table.rows],
+        bars=bars,
+        note=_rates_note(summary),
+    )
+
+
+def _rates_note(summary: AttackSummary) -> str:
+    """Return how the images of the verification were rendered, and the intervals made."""
+    spp = f", {summary.verified.spp} samples per pixel" if summary.verified else ""
+    return f"Fresh seeds, pictures rounded to 8 bits, Clopper-Pearson intervals{spp}."
+
+
+def _list_rate_bars(
+    summary: AttackSummary,
+) -> list[tuple[float, float, float] | None]:
+    """Return the bar of each row of the rates: an interval with a mark at the rate.
+
+    A bar is (begin, end, mark); None if the row has no rate.
+    """
     # in the order of the table's rows, see `display._rates_part`
     rates: list[ControlGroup | VerifiedRate | None] = [summary.clean.control]
     if summary.adversarial:
         rates.append(summary.verified)
     if summary.baseline:
         rates.append(summary.baseline.verified)
-    # A bar is an interval with a mark at the rate: (begin, end, mark).
-    bars = [None if rate is None else (*rate.interval, rate.rate) for rate in rates]
-    if average:
-        bars.append((*average.interval, average.accuracy))
-    has_rates = any(bars)
-    if not has_rates:
-        return ResultPart()
-    spp = f", {summary.verified.spp} samples per pixel" if summary.verified else ""
-    note = f"Fresh seeds, pictures rounded to 8 bits, Clopper-Pearson intervals{spp}."
+    bars: list[tuple[float, float, float] | None] = [
+        None if rate is None else (*rate.interval, rate.rate) for rate in rates
+    ]
+    if summary.average:
+        bars.append((*summary.average.interval, summary.average.accuracy))
+    return bars
 
-    def put_rate_first(cells: Sequence[str]) -> list[str]:
-        """Move rate and interval right after the name: a phone cuts off the rest."""
-        name, prediction, number, rate, interval = cells
-        return [name, rate, interval, prediction, number]
 
-    return replace(
-        table,
-        title="Verified rates",
-        column_heads=put_rate_first(table.column_heads),
-        rows=[put_rate_first(row) for row in table.rows],
-        bars=bars,
-        note=note,
-    )
+def _put_rate_first(cells: Sequence[str]) -> list[str]:
+    """Move rate and interval right after the name: a phone cuts off the rest."""
+    name, prediction, number, rate, interval = cells
+    return [name, rate, interval, prediction, number]
 
 
 def _search_part(
@@ -389,25 +473,12 @@ def _search_part(
         objectives: objectives of the "search" and of the "baseline", the random search,
             in order of evaluation; None if an objective was not a number.
     """
-    curves = dict[str, list[float | None]]()
-    ranges = []
-    for kind, name in (("search", summary.policy), ("baseline", "random search")):
-        values = objectives.get(kind, [])
-        known = [value for value in values if value is not None]
-        if known:
-            curves[name] = values
-            ranges.append(f"{name}: from {known[0]:.3g} to {max(known):.3g}")
+    curves = _select_curves(summary, objectives)
     if not curves:
         return ResultPart()
-    # the text at the zero line: what a prediction is if the objective is above 0
-    zero_means = ""
-    if summary.objective in words.SUCCESS_ABOVE_ZERO:
-        # With the setting `minimise` the search seeks a right prediction.
-        prediction = wording.format_success_word(summary)
-        if summary.minimises:
-            prediction = "right"
-        zero_means = f"above: {prediction}"
+    ranges = [_curve_range_text(name, values) for name, values in curves.items()]
     label = words.format_objective(summary.objective)
+    zero_means = _zero_line_text(summary)
     return ResultPart(
         "The search",
         [f"{label} over evaluations. {'; '.join(ranges)}"],
@@ -415,6 +486,34 @@ def _search_part(
         note="Lines: the best so far. Dots: each evaluation. These are claims of the "
         "search; the table above is verified.",
     )
+
+
+def _select_curves(
+    summary: AttackSummary, objectives: Mapping[str, list[float | None]]
+) -> dict[str, list[float | None]]:
+    """Return the objectives of the searches with any, by the name of the policy."""
+    curves = dict[str, list[float | None]]()
+    for kind, name in (("search", summary.policy), ("baseline", "random search")):
+        values = objectives.get(kind, [])
+        if any(value is not None for value in values):
+            curves[name] = values
+    return curves
+
+
+def _curve_range_text(name: str, values: Sequence[float | None]) -> str:
+    """Return the first and the largest objective of a search, with its name."""
+    known = [value for value in values if value is not None]
+    return f"{name}: from {known[0]:.3g} to {max(known):.3g}"
+
+
+def _zero_line_text(summary: AttackSummary) -> str:
+    """Return what a prediction is if the objective is above 0; empty if not known."""
+    if summary.objective not in words.SUCCESS_ABOVE_ZERO:
+        return ""
+    # With the setting `minimise` the search seeks a right prediction.
+    if summary.minimises:
+        return "above: right"
+    return f"above: {wording.format_success_word(summary)}"
 
 
 def _plan_part(plan: PlannedGradient) -> ResultPart:
@@ -427,12 +526,10 @@ def _plan_part(plan: PlannedGradient) -> ResultPart:
         "step": _step_text,
     }
     spp = "" if plan.spp is None else f", {format_count(plan.spp, 'sample')} a pixel"
-    renders = (
-        f"{format_count(plan.renders_per_gradient, 'render')} per gradient in addition "
-        "to the picture itself"
-    )
+    renders = format_count(plan.renders_per_gradient, "render")
     title = (
-        f"Gradient plan: {format_count(len(plan.groups), 'parameter')}, {renders}{spp}"
+        f"Gradient plan: {format_count(len(plan.groups), 'parameter')}, {renders} per "
+        f"gradient in addition to the picture itself{spp}"
     )
     return ResultPart.make_table(plan.groups, columns, title=title, folded=True)
 

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from torch import Tensor
 
 from advsearch import losses
-from advsearch.api.keywords import Names, SceneKeywords, with_settings_signature
+from advsearch.api.keywords import (
+    Names,
+    SceneKeywords,
+    drop_unset,
+    with_settings_signature,
+)
 from advsearch.attacks import Policy, make_policy
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.config import SceneConfig
@@ -112,38 +118,29 @@ def attack(
         resume: continue the run in that directory, if there is one, from where it was
             stopped. All other arguments have to be the same as before.
     """
-    options = _drop_unset(settings)
+    options = drop_unset(settings)
     if callable(task):  # a function of the caller
         task = make_task(task)
     _check_policy(policy)
-    session_controls = [
-        *loading.list_session_only_controls(controls),
-        *loading.list_session_only_controls(over),
-    ]
-    _check_can_use_workers(scene, model, task, objective, session_controls, options)
+    request = AttackRequest(
+        model=model,
+        task=task,
+        controls=controls,
+        objective=objective,
+        policy=policy,
+        over=over,
+        metrics=metrics,
+        session_controls=_list_session_controls(controls, over),
+    )
+    request.check_can_use_workers(scene, options)
     scene = _load_scene(scene, object, options)
-
-    # the settings as `run.yaml` states them, with the names of the caller's objects
-    config = _make_config(
-        scene, model, task, controls, objective, policy, over, metrics, run, options
-    )
-    losses.check_direction(objective, targeted=config.target is not None)
-
-    python_only = _find_python_only(
-        config, scene, model, task, objective, policy, session_controls
-    )
-    config = config.with_python_only_parts(python_only)
-    _check_single_attack(config)
+    config = request.make_checked_config(scene, run, options)
 
     # The caller's own objects are used. The others are made from the settings.
     searched, random_controls = make_attack_controls(config, controls, over)
     if not isinstance(policy, Policy):
-        policy = make_policy(config.policy_name, **config.policy_options)
-    loaded_task, objective = make_task_and_objective(
-        config,
-        task if isinstance(task, Task) else config.task,
-        objective if callable(objective) else config.objective,
-    )
+        policy = _make_configured_policy(config)
+    loaded_task, objective = request.choose_task_and_objective(config)
     # `directory` is None if nothing is stored, or if another run is overwritten.
     with _open_run(run, resume, config) as directory:
         parts = AttackParts(
@@ -174,63 +171,19 @@ def _check_policy(policy: object) -> None:
         )
 
 
-def _drop_unset(settings: Mapping[str, object]) -> dict[str, Any]:
-    """Return the settings that are not None."""
-    return {name: value for name, value in settings.items() if value is not None}
-
-
-def _check_can_use_workers(
-    scene: Scene | str | Path | Mapping[str, object],
-    model: AnyModel | Sequence[AnyModel],
-    task: str | Mapping[str, object] | Task,
-    objective: str | Callable[..., Tensor] | None,
-    session_controls: Sequence[Any],
-    options: Mapping[str, Any],
-) -> None:
-    """Raise an error if workers are requested but cannot load what the caller passed.
-
-    Workers are other processes. They load everything by its name, and do not have the
-    objects of this session.
-
-    Args:
-        scene: scene as the caller passed it; names and paths can be loaded.
-        model: model or models as the caller passed them.
-        task: task as the caller passed it.
-        objective: a name, or a function of the session.
-        session_controls: names of the controls that exist in this session only.
-        options: the settings that the caller passed, perhaps with `workers`.
-
-    Raises:
-        InputError: workers are requested, and some object exists in this session only.
-    """
-    objects = [
-        value
-        for value in (scene, *to_model_list(model))
-        if not isinstance(value, (str, Path))
+def _list_session_controls(searched: Controls, random: Controls) -> list[str]:
+    """Return the names of the controls that exist in this session only."""
+    return [
+        *loading.list_session_only_controls(searched),
+        *loading.list_session_only_controls(random),
     ]
-    has_functions = callable(objective) or isinstance(task, FunctionTask)
-    if objects or has_functions or session_controls:
-        naming.check_no_worker_settings(options)
 
 
-def _make_config(
-    scene: Scene,
-    model: AnyModel | Sequence[AnyModel],
-    task: Any,
-    controls: Controls,
-    objective: str | Callable[..., Tensor] | None,
-    policy: str | Mapping[str, object] | Policy[Any],
-    over: Controls,
-    metrics: Mapping[str, str | Metric] | None,
-    run: str | Path | None,
-    options: dict[str, Any],
-) -> AttackConfig:
-    """Return the settings of an attack, as `run.yaml` states them.
+@dataclass(frozen=True, eq=False)
+class AttackRequest:
+    """What the caller of `attack` passed: names, settings, or objects of the session.
 
-    Objects of the caller, such as a loaded model, are replaced by their names.
-
-    Args:
-        scene: the loaded scene.
+    Attributes:
         model: model or models.
         task: a name, settings or an instance.
         controls: controls that are searched.
@@ -238,24 +191,150 @@ def _make_config(
         policy: a name, settings or an instance.
         over: controls that vary by chance.
         metrics: functions by name.
-        run: the run directory; None stores nothing.
-        options: all other settings, by name.
+        session_controls: names of the controls that exist in this session only.
     """
-    objective_name = _name_objective(objective) if callable(objective) else objective
-    described = {
-        **loading.scene_to_settings(scene),
-        "model": ",".join(map(get_model_name, to_model_list(model))),
-        "controls": loading.controls_to_settings(controls),
-        "over": loading.controls_to_settings(over),
-        "task": convert_to_setting(task) if isinstance(task, Task) else task,
-        "objective": objective_name,
-        "policy": convert_to_setting(policy) if isinstance(policy, Policy) else policy,
-        "metrics": judging.metrics_to_settings(metrics or {}),
-    }
-    if options.get("exposure"):  # this setting replaces the exposure of the scene
-        described["set"].pop("camera.exposure", None)
-    run_path = None if run is None else str(run)
-    return AttackConfig(**{**described, **options, "run": run_path})
+
+    model: AnyModel | Sequence[AnyModel]
+    task: str | Mapping[str, object] | Task
+    controls: Controls
+    objective: str | Callable[..., Tensor] | None
+    policy: str | Mapping[str, object] | Policy[Any]
+    over: Controls
+    metrics: Mapping[str, str | Metric] | None
+    session_controls: Sequence[str]
+
+    def check_can_use_workers(
+        self,
+        scene: Scene | str | Path | Mapping[str, object],
+        options: Mapping[str, Any],
+    ) -> None:
+        """Raise an error if workers are requested but cannot load what was passed.
+
+        Workers are other processes. They load everything by its name, and do not have
+        the objects of this session.
+
+        Args:
+            scene: scene as the caller passed it; names and paths can be loaded.
+            options: the settings that the caller passed, perhaps with `workers`.
+
+        Raises:
+            InputError: workers are requested, and some object exists in this session
+                only.
+        """
+        objects = [
+            value
+            for value in (scene, *to_model_list(self.model))
+            if not isinstance(value, (str, Path))
+        ]
+        has_functions = callable(self.objective) or isinstance(self.task, FunctionTask)
+        if objects or has_functions or self.session_controls:
+            naming.check_no_worker_settings(options)
+
+    def make_checked_config(
+        self, scene: Scene, run: str | Path | None, options: dict[str, Any]
+    ) -> AttackConfig:
+        """Return the settings of a single attack that can be made.
+
+        They have the names of the caller's objects, and state which of these exist in
+        this session only.
+
+        Args:
+            scene: the loaded scene.
+            run: the run directory; None stores nothing.
+            options: all other settings, by name.
+
+        Raises:
+            InputError: the attack cannot be made, or is several attacks.
+        """
+        config = self._make_config(scene, run, options)
+        losses.check_direction(self.objective, targeted=config.target is not None)
+        python_only = self._find_python_only(config, scene)
+        config = config.with_python_only_parts(python_only)
+        _check_single_attack(config)
+        return config
+
+    def _make_config(
+        self, scene: Scene, run: str | Path | None, options: dict[str, Any]
+    ) -> AttackConfig:
+        """Return the settings of an attack, as `run.yaml` states them.
+
+        Objects of the caller, such as a loaded model, are replaced by their names. See
+        `make_checked_config` for the arguments.
+        """
+        described = {**loading.scene_to_settings(scene), **self._to_settings()}
+        if options.get("exposure"):  # this setting replaces the exposure of the scene
+            described["set"].pop("camera.exposure", None)
+        run_path = None if run is None else str(run)
+        return AttackConfig(**{**described, **options, "run": run_path})
+
+    def _to_settings(self) -> dict[str, Any]:
+        """Return the settings that describe what was passed, without the scene."""
+        objective = self.objective
+        if callable(objective):
+            objective = _name_objective(objective)
+        return {
+            "model": ",".join(map(get_model_name, to_model_list(self.model))),
+            "controls": loading.controls_to_settings(self.controls),
+            "over": loading.controls_to_settings(self.over),
+            "task": _describe_instance(self.task, Task),
+            "objective": objective,
+            "policy": _describe_instance(self.policy, Policy),
+            "metrics": judging.metrics_to_settings(self.metrics or {}),
+        }
+
+    def _find_python_only(self, config: AttackConfig, scene: Scene) -> list[PythonOnly]:
+        """Return what exists in this session only, so that no command can repeat it.
+
+        Args:
+            config: the settings.
+            scene: the loaded scene.
+        """
+        parts = self._find_session_only_models()
+        if scene.is_session_only:
+            parts.append(PythonOnly("scene"))
+        parts += self._find_undescribable_parts()
+        parts += [PythonOnly("control", name) for name in self.session_controls]
+        metrics = judging.list_session_only_metrics(config.metrics)
+        parts += [PythonOnly("metric", name) for name in metrics]
+        return parts
+
+    def _find_session_only_models(self) -> list[PythonOnly]:
+        """Return the models that exist in this session only."""
+        return [
+            PythonOnly("model", get_model_name(network))
+            for network in to_model_list(self.model)
+            if naming.is_session_only(network)
+        ]
+
+    def _find_undescribable_parts(self) -> list[PythonOnly]:
+        """Return the task, the objective and the policy that no setting describes."""
+        parts = []
+        task = self.task
+        if isinstance(task, Task) and not is_describable_by_setting(task, make_task):
+            parts.append(PythonOnly("task", task.name))
+        if callable(self.objective):
+            parts.append(PythonOnly("objective", _name_objective(self.objective)))
+        policy = self.policy
+        if isinstance(policy, Policy) and not is_describable_by_setting(
+            policy, _make_policy
+        ):
+            parts.append(PythonOnly("policy", policy.name))
+        return parts
+
+    def choose_task_and_objective(
+        self, config: AttackConfig
+    ) -> tuple[Task, str | Callable[..., Tensor]]:
+        """Return the caller's task and objective, or those that the settings name."""
+        return make_task_and_objective(
+            config,
+            self.task if isinstance(self.task, Task) else config.task,
+            self.objective if callable(self.objective) else config.objective,
+        )
+
+
+def _describe_instance(value: Any, kind: type[Any]) -> Any:
+    """Return the setting that describes an instance of a class; other values as is."""
+    return convert_to_setting(value) if isinstance(value, kind) else value
 
 
 def _open_run(run: str | Path | None, resume: bool, config: AttackConfig) -> Any:
@@ -276,49 +355,6 @@ def _open_run(run: str | Path | None, resume: bool, config: AttackConfig) -> Any
     return create_before_work(config)
 
 
-def _find_python_only(
-    config: AttackConfig,
-    scene: Scene,
-    model: AnyModel | Sequence[AnyModel],
-    task: AnyTask,
-    objective: str | Callable[..., Tensor] | None,
-    policy: str | Mapping[str, object] | Policy[Any],
-    session_controls: Sequence[str],
-) -> list[PythonOnly]:
-    """Return what exists in this session only, so that no command can repeat it.
-
-    Args:
-        config: the settings.
-        scene: the loaded scene.
-        model: model as the caller passed it.
-        task: task as the caller passed it.
-        objective: a name, or a function of the session.
-        policy: a name, settings or an instance.
-        session_controls: names of the controls that exist in this session only.
-    """
-    parts = [
-        PythonOnly("model", get_model_name(network))
-        for network in to_model_list(model)
-        if naming.is_session_only(network)
-    ]
-    if scene.is_session_only:
-        parts.append(PythonOnly("scene"))
-    if isinstance(task, Task) and not is_describable_by_setting(task, make_task):
-        parts.append(PythonOnly("task", task.name))
-    if callable(objective):
-        parts.append(PythonOnly("objective", _name_objective(objective)))
-    if isinstance(policy, Policy) and not is_describable_by_setting(
-        policy, _make_policy
-    ):
-        parts.append(PythonOnly("policy", policy.name))
-    parts += [PythonOnly("control", name) for name in session_controls]
-    parts += [
-        PythonOnly("metric", name)
-        for name in judging.list_session_only_metrics(config.metrics)
-    ]
-    return parts
-
-
 def _load_scene(
     scene: Scene | str | Path | Mapping[str, object],
     shape: str | None,
@@ -334,13 +370,7 @@ def _load_scene(
     if isinstance(scene, Scene):
         naming.check_no_scene_settings({**options, "object": shape})
         return scene
-    scene_options = {
-        name: options[name] for name in naming.SCENE_SETTINGS if name in options
-    }
-    # The setting `object` is required, but only the other settings are used.
-    config = SceneConfig(**{"object": "mug", **scene_options})
-    environment = config.environment
-    keywords = naming.make_scene_kwargs(config)
+    environment, keywords = _make_loading_keywords(options)
     # The first argument of `load_scene` is the object: one shape of a scene with several
     # shapes, or the name or file that `scene` is.
     if shape is not None:
@@ -348,6 +378,22 @@ def _load_scene(
     if isinstance(scene, Mapping):
         raise InputError("object: which shape of the scene is it? Give its id")
     return loading.load_scene(scene, environment, **keywords)
+
+
+def _make_loading_keywords(
+    options: Mapping[str, Any],
+) -> tuple[str | None, dict[str, Any]]:
+    """Return the environment and the other keywords with which a scene is loaded.
+
+    Args:
+        options: the settings that the caller passed; those of the scene are used.
+    """
+    scene_options = {
+        name: options[name] for name in naming.SCENE_SETTINGS if name in options
+    }
+    # The setting `object` is required, but only the other settings are used.
+    config = SceneConfig(**{"object": "mug", **scene_options})
+    return config.environment, naming.make_scene_kwargs(config)
 
 
 def _name_objective(objective: Callable[..., Tensor]) -> str:
@@ -363,7 +409,11 @@ def _name_objective(objective: Callable[..., Tensor]) -> str:
 def _make_policy(setting: Any) -> Policy[Any]:
     """Make the policy that a setting names."""
     # The setting `object` is required, but only the policy is used.
-    config = AttackConfig(object="mug", policy=setting)
+    return _make_configured_policy(AttackConfig(object="mug", policy=setting))
+
+
+def _make_configured_policy(config: AttackConfig) -> Policy[Any]:
+    """Make the policy that settings name, with its options."""
     return make_policy(config.policy_name, **config.policy_options)
 
 
@@ -377,6 +427,13 @@ def _check_single_attack(config: AttackConfig) -> None:
     """
     if config.workers is not None or config.cluster is not None:
         judging.check_metrics_importable(config.metrics)
+    _check_not_study(config)
+    if config.aov is not None and config.run is None:
+        raise InputError("aov: needs `run`, the directory that the layers are saved in")
+
+
+def _check_not_study(config: AttackConfig) -> None:
+    """Raise an error if the settings describe attacks on several models or epsilons."""
     if config.is_matrix and config.ensemble is None:
         raise InputError(
             "model: expected one, got several; add `ensemble`, which attacks them "
@@ -388,5 +445,3 @@ def _check_single_attack(config: AttackConfig) -> None:
             f"epsilon: expected one, got {epsilons}; attack with each, or have "
             "`advsearch attack` draw the curve"
         )
-    if config.aov is not None and config.run is None:
-        raise InputError("aov: needs `run`, the directory that the layers are saved in")

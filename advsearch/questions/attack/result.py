@@ -20,7 +20,7 @@ from PIL import Image
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks import Ending, SearchResult
+from advsearch.attacks import Ending, SearchResult, Verification
 from advsearch.controls.base import Control
 from advsearch.controls.ranges import OneOf
 from advsearch.engine.judging import make_ensemble_task
@@ -36,11 +36,12 @@ from advsearch.report.views import get_view, join_images, make_notebook_html
 from advsearch.runs import files, store
 from advsearch.runs.directory import IMAGES, OBJECT_FILE, RunDirectory
 from advsearch.scene.assembly import pose_mesh
-from advsearch.scene.assets import Shape, make_simplifier
+from advsearch.scene.assets import Mesh, Shape, make_simplifier
 from advsearch.scene.color import round_to_8_bit
 from advsearch.scene.description import OBJECT
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.glb import encode_web_glb
+from advsearch.scene.parts import MeshPart
 from advsearch.scene.settings import SettingValues
 from advsearch.settings import to_python
 from advsearch.tasks import Judgement, Mark
@@ -222,28 +223,20 @@ class AttackResult:
             InputError: the adversarial configuration itself sets one of `settings`, or
                 has not as many numbers as the controls take in the other scene.
         """
-        if self.parts is None:
-            raise InputError(
-                "render: expected a result of this session, got one from another "
-                "process; load_run(FOLDER) loads one that can be rendered"
-            )
+        load_parts = self._get_parts_loader()
         _check_render_keywords(options)
-        # `self.parts` is a function: parts of a stored run are loaded only when needed
-        parts = self.parts()
+        # parts of a stored run are loaded only when needed
+        parts = load_parts()
         camera_name, settings = _split_camera(to_python(camera), to_python(settings))
-        clashes = set(settings or {}) & set(self.summary.configuration or {})
-        if clashes:
-            raise InputError(
-                f"settings: the adversarial configuration sets {min(clashes)}; leave it "
-                "out"
-            )
+        self._check_no_clashes(settings)
         task = parts.task
         if model is None:
             # the attack's own model, which may be an ensemble
             model, _ = parts.model_and_warnings
             task = make_ensemble_task(task, model)
+        viewed_scene = _resolve_scene(scene, parts.scene)
         return render(
-            _change_view(_resolve_scene(scene, parts.scene), camera_name, settings),
+            _change_view(viewed_scene, camera_name, settings),
             model,
             task=task,
             label=parts.config.label,
@@ -251,6 +244,28 @@ class AttackResult:
             at=self.u,
             **{**parts.config.image_settings, **options},
         )
+
+    def _get_parts_loader(self) -> Callable[[], AttackParts]:
+        """Return the function that returns the parts of the attack.
+
+        Raises:
+            InputError: the result came from another process, and has no such function.
+        """
+        if self.parts is None:
+            raise InputError(
+                "render: expected a result of this session, got one from another "
+                "process; load_run(FOLDER) loads one that can be rendered"
+            )
+        return self.parts
+
+    def _check_no_clashes(self, settings: SettingValues | None) -> None:
+        """Raise an error if the configuration itself sets one of the settings."""
+        clashes = set(settings or {}) & set(self.summary.configuration or {})
+        if clashes:
+            raise InputError(
+                f"settings: the adversarial configuration sets {min(clashes)}; leave it "
+                "out"
+            )
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what is pickled: all but the parts, which only this session has."""
@@ -350,17 +365,12 @@ class StoredImage:
         if trial is None:
             seed = seeds.derive_seed(problem.seed, "pictures")
             configuration = problem.make_full_configuration(u, None)
-            spp = UNTRIED_SPP
         else:
             # as in the trial, which has the same seed
             seed = seeds.derive_seed(problem.seed, "verification", trial)
             configuration = problem.make_full_configuration(u, seed)
-            spp = findings.spp
-        renderer = problem.renderer
-        with torch.no_grad(), renderer.share_paths(problem.shared_paths):
-            radiance = renderer.radiance(configuration, seed, spp)
-            display = renderer.formation.map_to_display(radiance)
-            image = round_to_8_bit(problem.space.apply_to_image(configuration, display))
+        spp = UNTRIED_SPP if trial is None else findings.spp
+        radiance, image = _render_stored(problem, configuration, seed, spp)
         return cls(
             full_configuration=configuration,
             radiance=radiance,
@@ -368,6 +378,28 @@ class StoredImage:
             judgement=problem.judge(image, configuration),
             trial=trial,
         )
+
+
+def _render_stored(
+    problem: Problem, configuration: Tensor, seed: int, spp: int
+) -> tuple[Tensor, Tensor]:
+    """Render a configuration, and return its radiance and the image that the model gets.
+
+    Args:
+        problem: problem of the attack.
+        configuration: (d,) with the coordinates of the conditions.
+        seed: seed of the render.
+        spp: samples per pixel.
+
+    Returns:
+        (H, W, 3) linear, and (H, W, 3) sRGB with 8-bit values in [0, 1].
+    """
+    renderer = problem.renderer
+    with torch.no_grad(), renderer.share_paths(problem.shared_paths):
+        radiance = renderer.radiance(configuration, seed, spp)
+        display = renderer.formation.map_to_display(radiance)
+        image = round_to_8_bit(problem.space.apply_to_image(configuration, display))
+    return radiance, image
 
 
 def choose_stored_trial(findings: RunState) -> int | None:
@@ -383,27 +415,35 @@ def choose_stored_trial(findings: RunState) -> int | None:
     if verification is None:
         clean_labels = _list_labels(findings.clean_trials)
         return clean_labels.index(mode(clean_labels)) if clean_labels else None
+    criteria = _list_trial_criteria(verification)
+    # Tuples are compared element by element, and True is larger than False.
+    first_best = criteria.index(max(criteria))
+    return verification.first_index + first_best
+
+
+def _list_trial_criteria(verification: Verification) -> list[tuple[bool, bool, bool]]:
+    """Return which criteria each trial meets, the most important first.
+
+    These are: the adversarial scene has its most frequent label with the typical
+    outcome; it has this label; the clean scene has its most frequent label.
+    """
     clean_labels = _list_labels(verification.clean_trials)
     # A trial is a success (True), a failure (False), or does not count (None).
     has_successes = bool(verification.successful_trials)
     typical_trials = verification.successful_trials or verification.valid_trials
     frequent_label = mode(_list_labels(typical_trials))
     frequent_clean_label = mode(clean_labels)
-    # The criteria that each trial meets, the most important first.
     criteria = list[tuple[bool, bool, bool]]()
+    labels = _list_labels(verification.adversarial_trials)
+    # `strict=False`: trials of one scene may have ended earlier.
     for label, is_success, clean_label in zip(
-        _list_labels(verification.adversarial_trials),
-        verification.trial_successes,
-        clean_labels,
-        strict=False,  # trials of one scene may have ended earlier
+        labels, verification.trial_successes, clean_labels, strict=False
     ):
         has_label = label == frequent_label
         is_typical = has_label and is_success is has_successes
         has_clean_label = clean_label == frequent_clean_label
         criteria.append((is_typical, has_label, has_clean_label))
-    # Tuples are compared element by element, and True is larger than False.
-    first_best = criteria.index(max(criteria))
-    return verification.first_index + first_best
+    return criteria
 
 
 def _list_labels(trials: Sequence[Judgement]) -> list[str]:
@@ -430,35 +470,47 @@ def save_images(
     """
     for name, image in scene_images.items():
         _save_scene_image(run, problem, name, image)
-    difference = files.amplify_difference(
-        scene_images["clean"].image, scene_images["adversarial"].image
-    )
+    adversarial = scene_images["adversarial"].image
+    difference = files.amplify_difference(scene_images["clean"].image, adversarial)
     run.save_image("difference", difference)
+    _save_trials(run, problem, findings)
+    if findings.search_frames:
+        last_frame = _make_last_frame(problem, findings, adversarial)
+        run.save_animation("search", [*findings.search_frames, last_frame.numpy()])
+
+
+def _save_trials(run: RunDirectory, problem: Problem, findings: RunState) -> None:
+    """Save the images of the first trials of the adversarial scene."""
     verification = findings.verification
+    if verification is None:
+        return
     # Images of trials are cached by the kind of the verification. If the random search
     # found a worse configuration, the adversarial one was verified as the baseline.
     kind = "verification"
     if findings.outdone_verification is not None:
         kind = "baseline verification"
-    if verification is not None:
-        end = verification.first_index + len(verification.adversarial_trials)
-        for number in range(verification.first_index, end)[:MAX_STORED_IMAGES]:
-            save_trial(
-                run,
-                problem,
-                findings,
-                trial=(kind, number),
-                name=f"verification-{number:02d}",
-                u=verification.u,
-            )
-    if findings.search_frames:
-        last_frame = scene_images["adversarial"].image
-        if problem.conditions is not None and findings.search_result is not None:
-            # The image of the adversarial scene may have the conditions of a trial. All
-            # frames have the start values of the conditions, and so must the last one.
-            u = problem.domain.project(findings.search_result.best_u)
-            last_frame = StoredImage.render(problem, findings, u, trial=None).image
-        run.save_animation("search", [*findings.search_frames, last_frame.numpy()])
+    end = verification.first_index + len(verification.adversarial_trials)
+    for number in range(verification.first_index, end)[:MAX_STORED_IMAGES]:
+        name = f"verification-{number:02d}"
+        save_trial(run, problem, findings, (kind, number), name, verification.u)
+
+
+def _make_last_frame(
+    problem: Problem, findings: RunState, adversarial: Tensor
+) -> Tensor:
+    """Return the last frame of the search's animation: the adversarial scene (H, W, 3).
+
+    Args:
+        problem: problem of the attack.
+        findings: findings of the attack.
+        adversarial: (H, W, 3) the stored image of that scene.
+    """
+    if problem.conditions is None or findings.search_result is None:
+        return adversarial
+    # The image of the adversarial scene may have the conditions of a trial. All frames
+    # have the start values of the conditions, and so must the last one.
+    u = problem.domain.project(findings.search_result.best_u)
+    return StoredImage.render(problem, findings, u, trial=None).image
 
 
 def _save_scene_image(
@@ -512,12 +564,8 @@ def save_trial(
     if image is None:
         image = problem.picture(u, seed, findings.spp)
     run.save_image(name, image)
-    save_with_marks(
-        run,
-        name,
-        image,
-        problem.find_marks(image, problem.make_full_configuration(u, seed)),
-    )
+    marks = problem.find_marks(image, problem.make_full_configuration(u, seed))
+    save_with_marks(run, name, image, marks)
 
 
 def save_with_marks(
@@ -546,29 +594,76 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
     # the inputs of both scenes
     adversarial = _assemble(problem, u)
     clean = _assemble(problem, problem.domain.start)
-    # An input of the scene is named as "mug.bsdf.reflectance": the mesh comes first.
-    changed_names = {OBJECT, *(name.partition(".")[0] for name in adversarial)}
-    meshes = [mesh for name, mesh in scene.meshes.items() if name in changed_names]
-    max_faces = MAX_FACES // len(meshes)
-    # the function that simplifies each mesh; None if the mesh has few faces already
-    simplifiers = {mesh.name: make_simplifier(mesh.mesh, max_faces) for mesh in meshes}
+    objects = _SimplifiedObjects.from_meshes(_select_changed(scene, adversarial))
+    to_world = _find_camera_pose(adversarial, scene)
+    glb = encode_web_glb(
+        objects.make_shapes(adversarial),
+        objects.make_shapes(clean),
+        to_world,
+        objects.describe_simplified(),
+    )
+    write_bytes(run.path / OBJECT_FILE, glb)
 
-    def make_shapes(inputs: Mapping[str, Tensor]) -> list[Shape]:
-        """Return the shapes near the object, with fewer faces."""
-        shapes = {mesh.name: pose_mesh(mesh, inputs) for mesh in meshes}
+
+def _select_changed(scene: Any, inputs: Mapping[str, Tensor]) -> list[MeshPart]:
+    """Return the meshes of a scene that controls move or paint, and the object.
+
+    Args:
+        scene: the scene.
+        inputs: inputs of the scene that controls set, by name.
+    """
+    # An input of the scene is named as "mug.bsdf.reflectance": the mesh comes first.
+    changed_names = {OBJECT, *(name.partition(".")[0] for name in inputs)}
+    return [mesh for name, mesh in scene.meshes.items() if name in changed_names]
+
+
+@dataclass(frozen=True, eq=False)
+class _SimplifiedObjects:
+    """The meshes of a file for a browser, with the functions that simplify them.
+
+    Attributes:
+        meshes: meshes of the scene.
+        simplifiers: function that simplifies each mesh, by name; None if the mesh has
+            few faces already.
+    """
+
+    meshes: Sequence[MeshPart]
+    simplifiers: Mapping[str, Callable[[Mesh], Mesh] | None]
+
+    @classmethod
+    def from_meshes(cls, meshes: Sequence[MeshPart]) -> _SimplifiedObjects:
+        """Return meshes with functions that simplify them to about `MAX_FACES` in all."""
+        max_faces = MAX_FACES // len(meshes)
+        simplifiers = {
+            mesh.name: make_simplifier(mesh.mesh, max_faces) for mesh in meshes
+        }
+        return cls(meshes, simplifiers)
+
+    def make_shapes(self, inputs: Mapping[str, Tensor]) -> list[Shape]:
+        """Return the shapes near the object, with fewer faces.
+
+        Args:
+            inputs: inputs of the scene, such as poses, by name.
+        """
+        shapes = {mesh.name: pose_mesh(mesh, inputs) for mesh in self.meshes}
         near_shapes = []
         for shape in _select_near(shapes):
-            simplify = simplifiers[shape.name]
+            simplify = self.simplifiers[shape.name]
             if simplify is not None:
                 shape = replace(shape, mesh=simplify(shape.mesh))
             near_shapes.append(shape)
         return near_shapes
 
-    to_world = _find_camera_pose(adversarial, scene)
-    simplified = [mesh for mesh in meshes if simplifiers[mesh.name] is not None]
-    note = _describe_simplified(simplified)
-    glb = encode_web_glb(make_shapes(adversarial), make_shapes(clean), to_world, note)
-    write_bytes(run.path / OBJECT_FILE, glb)
+    def describe_simplified(self) -> str:
+        """Return the note on meshes that have fewer faces in the file; empty if none."""
+        full_counts = [
+            f"{len(mesh.mesh.faces):,} of {mesh.name}"
+            for mesh in self.meshes
+            if self.simplifiers[mesh.name] is not None
+        ]
+        if not full_counts:
+            return ""
+        return f"It is shown with fewer faces than it has ({', '.join(full_counts)})."
 
 
 def _find_camera_pose(
@@ -579,18 +674,6 @@ def _find_camera_pose(
     if camera_pose is None:
         return camera_to_world(scene)
     return camera_pose.double().numpy()
-
-
-def _describe_simplified(simplified: Sequence[Any]) -> str:
-    """Return the note on meshes that have fewer faces in the file; empty without any.
-
-    Args:
-        simplified: the meshes before they were simplified.
-    """
-    if not simplified:
-        return ""
-    full_counts = [f"{len(mesh.mesh.faces):,} of {mesh.name}" for mesh in simplified]
-    return f"It is shown with fewer faces than it has ({', '.join(full_counts)})."
 
 
 def _assemble(problem: Problem, u: Tensor) -> Mapping[str, Tensor]:
@@ -643,23 +726,16 @@ def evaluate_drive(
     if path is None:
         return None
     path_names, frames = _make_frames(problem, path, time_column)
-    # All paths have the same range of times: the last frame is the end of any path.
-    first_time = _read_time(problem, path, frames[0])
-    last_time = _read_time(problem, path, frames[-1])
-    seconds = last_time - first_time
+    seconds = _measure_path_seconds(problem, path, frames)
     # The animation has the paths one after another.
     n_paths = max(1, len(path_names))  # a single path has no name
-    total_seconds = seconds * n_paths
     right_counts: dict[str, int] = {}
-    # the configuration of each scene, by the name of its files
-    for name, configuration in (("drive-clean", problem.domain.start), ("drive", u)):
-        if configuration is None:  # nothing was searched
-            continue
+    for name, configuration in _name_drive_configurations(problem, u).items():
         # The searched coordinates come first, then those that conditions vary.
         frames[:, : len(configuration)] = configuration
         images, right_counts[name] = _render_frames(problem, frames, spp)
         if run is not None:
-            save_drive(run, name, images, total_seconds)
+            save_drive(run, name, images, seconds * n_paths)
     return AlongDrive(
         frames=len(frames),
         seconds=seconds,
@@ -668,6 +744,34 @@ def evaluate_drive(
         adversarial=right_counts.get("drive"),
         spp=spp,
     )
+
+
+def _name_drive_configurations(problem: Problem, u: Tensor | None) -> dict[str, Tensor]:
+    """Return the configurations (d,) of both scenes by the names of their files.
+
+    Args:
+        problem: problem of the attack.
+        u: (d,) the adversarial configuration; None leaves it out.
+    """
+    configurations = {"drive-clean": problem.domain.start}
+    if u is not None:
+        configurations["drive"] = u
+    return configurations
+
+
+def _measure_path_seconds(problem: Problem, path: Any, frames: Tensor) -> float:
+    """Return the seconds from the first frame of a path to the last.
+
+    All paths have the same range of times: the last frame is the end of any path.
+
+    Args:
+        problem: problem of the attack.
+        path: the control that moves things along a path.
+        frames: (n, d) configurations of the frames.
+    """
+    first_time = _read_time(problem, path, frames[0])
+    last_time = _read_time(problem, path, frames[-1])
+    return last_time - first_time
 
 
 def _find_path(problem: Problem) -> tuple[Any, int]:
@@ -716,11 +820,21 @@ def _make_frames(
     frames[..., time_column] = torch.linspace(0.0, 1.0, FRAMES)
     path_column = time_column + 1  # the choice of path is the next coordinate
     for index, name in enumerate(names):
-        # Each choice has an equal interval of [0, 1]. The coordinate is the center of
-        # the first interval that belongs to this path.
-        coordinate = (choices.index(name) + 0.5) / len(choices)
-        frames[index, :, path_column] = coordinate
+        frames[index, :, path_column] = _find_path_coordinate(choices, name)
     return names, frames.flatten(0, 1)
+
+
+def _find_path_coordinate(choices: Sequence[Any], name: Any) -> float:
+    """Return the coordinate in [0, 1] with which a path is chosen.
+
+    Each choice has an equal interval of [0, 1]. The coordinate is the center of the
+    first interval that belongs to the path.
+
+    Args:
+        choices: paths, some perhaps repeated.
+        name: the path that is chosen.
+    """
+    return (choices.index(name) + 0.5) / len(choices)
 
 
 def _list_path_choices(path: Any) -> Sequence[Any]:
@@ -757,7 +871,8 @@ def _render_frames(
     for number, configuration in enumerate(frames):
         seed = seeds.derive_seed(problem.seed, "drive", number)
         with torch.no_grad():
-            image = round_to_8_bit(problem.renderer(configuration, seed=seed, spp=spp))
+            display = problem.renderer(configuration, seed=seed, spp=spp)
+            image = round_to_8_bit(display)
         is_right, marks = problem.predict_with_marks(image, configuration)
         if is_right:
             n_right += 1
@@ -781,8 +896,15 @@ def save_drive(
             but a frame at least `MIN_FRAME_MILLISECONDS`.
     """
     frames = [Image.fromarray(files.to_8bit(picture)) for picture in images]
-    stream = io.BytesIO()
     milliseconds = max(MIN_FRAME_MILLISECONDS, round(1000.0 * seconds / len(frames)))
+    animation = _encode_webp(frames, milliseconds)
+    write_bytes(run.path / IMAGES / f"{name}.webp", animation)
+    run.save_image(name, _make_strip(frames))
+
+
+def _encode_webp(frames: Sequence[Image.Image], milliseconds: int) -> bytes:
+    """Encode images as an animation, each of which lasts some milliseconds."""
+    stream = io.BytesIO()
     frames[0].save(
         stream,
         "WEBP",
@@ -792,13 +914,17 @@ def save_drive(
         loop=0,
         quality=80,
     )
-    write_bytes(run.path / IMAGES / f"{name}.webp", stream.getvalue())
+    return stream.getvalue()
+
+
+def _make_strip(frames: Sequence[Image.Image]) -> npt.NDArray[np.floating[Any]]:
+    """Return some of the frames side by side (h, w, 3), sRGB in [0, 1]."""
     width = max(1, round(frames[0].width * STRIP_HEIGHT / frames[0].height))
     strip = []
     for number in select_evenly(len(frames), MAX_STRIP_FRAMES):
         small = frames[number].resize((width, STRIP_HEIGHT), Image.Resampling.LANCZOS)
         strip.append(np.asarray(small, dtype=np.float32) / 255.0)
-    run.save_image(name, np.concatenate(strip, axis=1))
+    return np.concatenate(strip, axis=1)
 
 
 def select_evenly(count: int, max_count: int) -> npt.NDArray[np.int64]:

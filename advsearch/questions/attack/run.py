@@ -9,11 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from advsearch import seeds
-from advsearch.attacks import Policy, make_policy
+from advsearch.attacks import Policy, SearchResult, make_policy
 from advsearch.attacks.candidates import scale_domain
 from advsearch.attacks.policies import WithoutAscent
 from advsearch.attacks.trials import LADDER
@@ -107,7 +108,6 @@ def run_attack(
     if config.twins is not None:
         # The result is not used: the call raises an error if the run is corrupt.
         read_twins(config.twins)
-    model, loading_notes = parts.model_and_warnings
     with ExitStack() as stack:
         run = None
         if resumed is not None:
@@ -115,37 +115,71 @@ def run_attack(
         stages = Stages(progress)
         stages.begin("setup", PREPARING)
         problem = make_problem(parts)
-        warnings = _report_warnings(parts, progress, problem, loading_notes)
+        warnings = _report_warnings(parts, progress, problem)
         policy = choose_policy(parts.policy, problem, _find_gradient_setting(config))
         # The directory of a new run is made only now, as the parts fit together.
         if run is None and parts.is_stored:
             run = stack.enter_context(RunDirectory.open(config))
-        if run is not None:
-            check_digests(run, [model], find_user_functions(parts))
+        _check_same_parts(run, parts)
         with open_executor(config, WORKER, progress) as executor:
             # replays stored rows, renders and stores the others
             journal = Journal(run, ParallelEvaluator(problem, executor))
             _report_search_size(progress, config, problem)
             findings = _search(parts, config, policy, journal, stages)
-        if isinstance(problem.model.module, RemoteNetwork):
-            warnings.append(problem.model.module.spending_sentence)
-        result = make_result(
-            findings,
-            journal,
-            stages,
-            warnings,
-            object_name=config.object,
-            judge=config.judge,
-            policy=config.policy_name,
-            objective=_find_objective_name(parts),
-            printable=config.printable,
-            command_line=config.command_line(None if run is None else run.path),
-            python_only=config.python_only,
-            twins=config.twins,
-        )
+        result = _make_attack_result(parts, journal, stages, findings, warnings)
         # without the matrix of light transport, which may be large
         stored_parts = replace(parts, clean_matrix=CleanMatrix())
         return replace(result, parts=lambda: stored_parts)
+
+
+def _check_same_parts(run: RunDirectory | None, parts: AttackParts) -> None:
+    """Raise an error if a run was made with another model or other functions.
+
+    Args:
+        run: the run directory, with the digests of what made it, which a new run gets
+            here; None if nothing is stored.
+        parts: parts of the attack.
+    """
+    if run is not None:
+        model, _ = parts.model_and_warnings
+        check_digests(run, [model], find_user_functions(parts))
+
+
+def _make_attack_result(
+    parts: AttackParts,
+    journal: Journal,
+    stages: Stages,
+    findings: RunState,
+    warnings: list[str],
+) -> AttackResult:
+    """Make the result of an attack from its findings, and store it in the run, if any.
+
+    Args:
+        parts: parts of the attack.
+        journal: journal of the run.
+        stages: stages of the run, with the seconds that each took.
+        findings: findings of the attack.
+        warnings: warnings so far; what calls of a remote model cost is added.
+    """
+    config = parts.config
+    run = journal.run_directory
+    module = journal.problem.model.module
+    if isinstance(module, RemoteNetwork):
+        warnings.append(module.spending_sentence)
+    return make_result(
+        findings,
+        journal,
+        stages,
+        warnings,
+        object_name=config.object,
+        judge=config.judge,
+        policy=config.policy_name,
+        objective=_find_objective_name(parts),
+        printable=config.printable,
+        command_line=config.command_line(None if run is None else run.path),
+        python_only=config.python_only,
+        twins=config.twins,
+    )
 
 
 def _find_objective_name(parts: AttackParts) -> str | None:
@@ -156,19 +190,16 @@ def _find_objective_name(parts: AttackParts) -> str | None:
 
 
 def _report_warnings(
-    parts: AttackParts,
-    progress: Progress,
-    problem: Problem,
-    loading_notes: Sequence[str],
+    parts: AttackParts, progress: Progress, problem: Problem
 ) -> list[str]:
     """Report and return the warnings of loading and of the controls.
 
     Args:
-        parts: parts of the attack.
+        parts: parts of the attack, with the warnings of loading the model.
         progress: gets each warning as a message.
         problem: problem of the attack, whose controls have notes on the scene.
-        loading_notes: warnings of loading the model.
     """
+    _, loading_notes = parts.model_and_warnings
     warnings = [
         *problem.space.list_notes(parts.scene.description),
         *loading_notes,
@@ -296,39 +327,40 @@ def search_and_verify(
         printable=printable,
         max_extra_repeats=max_extra_repeats,
     )
+    run_searches: Callable[[], None] = partial(
+        search_with_baselines, searches, policy, seconds=seconds, baseline=baseline
+    )
     if smallest:
-        # The result is not used: the call raises an error if there is no budget, before
-        # anything is rendered.
-        scale_domain(problem.domain, 1.0)
+        _check_has_budget(problem)
+        run_searches = partial(find_smallest, searches, policy, verifier)
+    choose_render_plan = partial(
+        plan_renders,
+        policy,
+        journal,
+        stages,
+        specialise=specialise,
+        measure=measure,
+        deterministic=deterministic,
+        chooses_spp=chooses_spp,
+    )
+    prepare_predictor = partial(
+        choose_predictor,
+        policy,
+        journal,
+        stages,
+        findings,
+        specialise=specialise,
+        clean=clean or CleanMatrix(),
+    )
     try:
         with reraise_lost_interrupt():
-            plan_renders(
-                policy,
-                journal,
-                stages,
-                specialise=specialise,
-                measure=measure,
-                deterministic=deterministic,
-                chooses_spp=chooses_spp,
-            )
+            choose_render_plan()
             findings.first_look_trials = evaluate_clean_scene(
                 journal, stages, first_spp
             )
             if not is_already_wrong(verifier, in_any_case=smallest):
-                findings.predictor = choose_predictor(
-                    policy,
-                    journal,
-                    stages,
-                    findings,
-                    specialise=specialise,
-                    clean=clean or CleanMatrix(),
-                )
-                if smallest:
-                    find_smallest(searches, policy, verifier)
-                else:
-                    search_with_baselines(
-                        searches, policy, seconds=seconds, baseline=baseline
-                    )
+                findings.predictor = prepare_predictor()
+                run_searches()
                 verify_searches(verifier, is_smallest=smallest)
             if average:
                 verifier.try_random(average)
@@ -336,6 +368,12 @@ def search_and_verify(
         findings.interrupted = True
     stages.end()
     return findings
+
+
+def _check_has_budget(problem: Problem) -> None:
+    """Raise an error if nothing that is searched has a budget, which could shrink."""
+    # The result is not used: the call raises the error.
+    scale_domain(problem.domain, 1.0)
 
 
 def _choose_look_sizes(problem: Problem, trials: int | None) -> tuple[int, ...]:
@@ -368,51 +406,74 @@ def search_with_baselines(
         seconds: seconds that its search may take; None for no limit.
         baseline: whether a random search is made.
     """
+    steps = searches.problem.steps
+    search_result = _search_with_policy(searches, policy, seconds)
+    if seconds is not None:
+        # The other searches are as long as the first one was within the time.
+        steps = max(1, _count_history_renders(search_result))
+    if searches.printable:
+        _search_without_print_terms(searches, policy, steps)
+    if baseline and policy.name != "random":
+        _search_at_random(searches, steps)
+
+
+def _count_history_renders(result: SearchResult) -> int:
+    """Count the images that a search rendered, without those of its ranking."""
+    history = result.history  # lacks the ranking
+    return history[-1].renders if history else 0
+
+
+def _search_with_policy(
+    searches: Searches, policy: Policy[Any], seconds: float | None
+) -> SearchResult:
+    """Search with a policy; `seconds` limit the time, None does not."""
     problem = searches.problem
     findings = searches.run_state
-    steps = problem.steps
     searches.begin_stage(
         "search",
         f"searching with {policy.name}",
-        steps,
-        "`steps` or `seconds` shorten it",
+        problem.steps,
+        shorter="`steps` or `seconds` shorten it",
     )
     findings.search_result = searches.run_search(
         "search",
         policy,
-        steps,
+        problem.steps,
         problem.seed,
         frames=findings.search_frames,
         seconds=seconds,
     )
-    if seconds is not None:
-        # The other searches get as many steps as the first one rendered images within
-        # the time, without its ranking, which `history` lacks.
-        history = findings.search_result.history
-        n_renders = history[-1].renders if history else 0
-        steps = max(1, n_renders)
-    if searches.printable:
-        title = "searching without print terms, to see what they cost"
-        searches.begin_stage(
-            "without print terms",
-            title,
-            steps,
-            "`printable=false` leaves out this search and the print terms",
-        )
-        findings.result_without_print_terms = searches.run_search(
-            UNPRINTED, policy, steps, problem.seed
-        )
-    if baseline and policy.name != "random":
-        searches.begin_stage(
-            "baseline",
-            "searching at random, to compare",
-            steps,
-            "`baseline=false` leaves it out",
-        )
-        seed = seeds.derive_seed(problem.seed, "baseline")
-        findings.random_search_result = searches.run_search(
-            "baseline", make_policy("random"), steps, seed
-        )
+    return findings.search_result
+
+
+def _search_without_print_terms(
+    searches: Searches, policy: Policy[Any], steps: int
+) -> None:
+    """Search again without print terms, with a number of steps."""
+    title = "searching without print terms, to see what they cost"
+    searches.begin_stage(
+        "without print terms",
+        title,
+        steps,
+        shorter="`printable=false` leaves out this search and the print terms",
+    )
+    searches.run_state.result_without_print_terms = searches.run_search(
+        UNPRINTED, policy, steps, searches.problem.seed
+    )
+
+
+def _search_at_random(searches: Searches, steps: int) -> None:
+    """Search at random with a number of steps, to compare the policy with."""
+    searches.begin_stage(
+        "baseline",
+        "searching at random, to compare",
+        steps,
+        shorter="`baseline=false` leaves it out",
+    )
+    seed = seeds.derive_seed(searches.problem.seed, "baseline")
+    searches.run_state.random_search_result = searches.run_search(
+        "baseline", make_policy("random"), steps, seed
+    )
 
 
 def choose_policy(
@@ -440,31 +501,47 @@ def choose_policy(
         InputError: the policy needs the gradient of a remote model, or takes no
             derivatives although a setting about them is set.
     """
-    # A block of parameters with the norm "box" is a range; others have an epsilon.
-    norms = {block.norm for block in problem.domain.blocks}
-    has_only_ranges = norms == {"box"}
-    has_only_budgets = "box" not in norms
-    is_remote = isinstance(problem.model.module, RemoteNetwork)
-    if is_remote:
-        if policy.name == "auto":
-            # `WithoutAscent` is `auto` without gradient steps
-            policy = WithoutAscent() if has_only_ranges else make_policy("nes")
-        elif policy.uses_gradient:
-            raise InputError(
-                f"policy: {policy.name} follows the model's gradient, and "
-                f"{problem.model.name}, behind an address, has "
-                "none; use auto, cmaes, nes, random, sobol or grid"
-            )
-    elif (
-        policy.name == "auto" and has_only_budgets and not problem.model.differentiable
-    ):
-        policy = make_policy("nes")
+    if isinstance(problem.model.module, RemoteNetwork):
+        policy = _choose_remote_policy(policy, problem)
+    elif policy.name == "auto" and not problem.model.differentiable:
+        has_only_budgets = "box" not in _list_norms(problem)
+        if has_only_budgets:
+            policy = make_policy("nes")
+    _check_takes_derivatives(policy, gradient_setting)
+    return policy
+
+
+def _check_takes_derivatives(policy: Policy[Any], gradient_setting: str | None) -> None:
+    """Raise an error if a setting about derivatives is set and a policy takes none."""
     if gradient_setting and not policy.uses_gradient:
         raise InputError(
             f"{gradient_setting}: policy {policy.name} takes no "
             "derivatives; leave one of the two out"
         )
+
+
+def _choose_remote_policy(policy: Policy[Any], problem: Problem) -> Policy[Any]:
+    """Return the policy that searches a remote model, which has no gradient.
+
+    Raises:
+        InputError: the policy needs a gradient.
+    """
+    if policy.name == "auto":
+        has_only_ranges = _list_norms(problem) == {"box"}
+        # `WithoutAscent` is `auto` without gradient steps
+        return WithoutAscent() if has_only_ranges else make_policy("nes")
+    if policy.uses_gradient:
+        raise InputError(
+            f"policy: {policy.name} follows the model's gradient, and "
+            f"{problem.model.name}, behind an address, has "
+            "none; use auto, cmaes, nes, random, sobol or grid"
+        )
     return policy
+
+
+def _list_norms(problem: Problem) -> set[str]:
+    """Return the norms of what is searched: "box" of ranges, others of budgets."""
+    return {block.norm for block in problem.domain.blocks}
 
 
 def _find_gradient_setting(config: AttackConfig) -> str | None:

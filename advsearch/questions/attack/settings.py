@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Any, ClassVar, Literal
 
 from pydantic import JsonValue, model_validator
@@ -368,11 +367,7 @@ class AttackConfig(DerivativeConfig):
         The text is ``pgd={momentum: 0.9}``. Options may have the steps of the search
         among them: ``{name: pgd, steps: 80, momentum: 0.9}`` sets `steps`, too.
         """
-        # Options without a name are those of "auto".
-        read_policy = partial(
-            parse_name_with_options, setting="policy", default_name="auto"
-        )
-        policy = read_policy(data.get("policy"))
+        policy = _read_policy_setting(data.get("policy"))
         if policy is None:  # the setting is missing
             return data
         if not isinstance(policy, Mapping):  # a name without options
@@ -383,7 +378,7 @@ class AttackConfig(DerivativeConfig):
         }
         # Read again: without `steps`, the mapping may have only the name, which then
         # becomes a text.
-        return {**data, **steps, "policy": read_policy(options)}
+        return {**data, **steps, "policy": _read_policy_setting(options)}
 
     @property
     def policy_name(self) -> str:
@@ -429,3 +424,9 @@ def parse_instance(parameter_name: str) -> str:
     """
     kind, colon, name = parameter_name.partition(":")
     return kind.partition(".")[0] + colon + name.partition(".")[0]
+
+
+def _read_policy_setting(value: Any) -> Any:
+    """Return a policy by name, or as a mapping with its name and its options."""
+    # Options without a name are those of "auto".
+    return parse_name_with_options(value, setting="policy", default_name="auto")

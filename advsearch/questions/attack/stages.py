@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from torch import Tensor
@@ -105,37 +105,81 @@ def plan_renders(
     problem = journal.problem
     stored = journal.get_note(PLAN_NOTE)
     if stored is not None:  # of a run that is continued
-        problem.gradient_plan = problem.gradient_plan.restore(stored["plan"])
-        problem.search_spp = stored["spp"]
-        problem.search_depth = stored["search_depth"]
+        _restore_choice(problem, stored)
         return
     is_full = measure == "full"
-    # for few renders the measurement would cost more than it saves
-    has_enough_renders = problem.steps >= planning.MIN_RENDERS_FOR_BOUNCES
-    if specialise and (is_full or has_enough_renders):
-        surface_light_refusal = surface_light.find_surface_light_refusal(
-            problem, problem.steps, policy, specialise
+    if specialise and _pays_to_measure_bounces(problem, policy, is_full=is_full):
+        _choose_bounces(problem, stages)
+    if policy.uses_gradient and _pays_to_measure_gradients(
+        problem, measure, specialise=specialise
+    ):
+        _measure_gradients(
+            problem,
+            stages,
+            full=is_full,
+            deterministic=deterministic,
+            chooses_spp=chooses_spp,
         )
-        can_surface_light_predict = surface_light_refusal is None
-        if not can_surface_light_predict:
-            _choose_bounces(problem, stages)
-    if policy.uses_gradient and measure != "no":
-        matrix_refusal = find_matrix_refusal(problem, problem.steps, specialise)
-        can_matrices_predict = matrix_refusal is None
-        if is_full or not can_matrices_predict:
-            _measure_gradients(
-                problem,
-                stages,
-                full=is_full,
-                deterministic=deterministic,
-                chooses_spp=chooses_spp,
-            )
+    _store_choice(journal)
+
+
+def _store_choice(journal: Journal) -> None:
+    """Store the plan, the samples and the light bounces of a problem in its run."""
+    problem = journal.problem
     choice = {
         "plan": problem.gradient_plan.to_dict(),
         "spp": problem.search_spp,
         "search_depth": problem.search_depth,
     }
     journal.set_note(PLAN_NOTE, choice)
+
+
+def _restore_choice(problem: Problem, stored: Mapping[str, Any]) -> None:
+    """Set the plan, the samples and the light bounces that a run has stored."""
+    problem.gradient_plan = problem.gradient_plan.restore(stored["plan"])
+    problem.search_spp = stored["spp"]
+    problem.search_depth = stored["search_depth"]
+
+
+def _pays_to_measure_bounces(
+    problem: Problem, policy: Policy[Any], *, is_full: bool
+) -> bool:
+    """Return whether to measure how many light bounces a search needs.
+
+    Args:
+        problem: problem of the attack, whose renders may leave out bounces.
+        policy: policy of the search.
+        is_full: whether a full measurement is requested.
+    """
+    # for few renders the measurement would cost more than it saves
+    has_enough_renders = problem.steps >= planning.MIN_RENDERS_FOR_BOUNCES
+    if not (is_full or has_enough_renders):
+        return False
+    refusal = surface_light.find_surface_light_refusal(
+        problem, problem.steps, policy, specialise=True
+    )
+    can_surface_light_predict = refusal is None
+    return not can_surface_light_predict
+
+
+def _pays_to_measure_gradients(
+    problem: Problem, measure: Measure, *, specialise: bool
+) -> bool:
+    """Return whether to measure which gradient estimators are best for a search.
+
+    A quick measurement is left out if matrices of light transport predict the images:
+    then no gradient is rendered.
+
+    Args:
+        problem: problem of the attack.
+        measure: which gradient estimators are to be measured.
+        specialise: whether images may be predicted.
+    """
+    if measure == "no":
+        return False
+    matrix_refusal = find_matrix_refusal(problem, problem.steps, specialise)
+    can_matrices_predict = matrix_refusal is None
+    return measure == "full" or not can_matrices_predict
 
 
 def _choose_bounces(problem: Problem, stages: Stages) -> None:
@@ -175,28 +219,10 @@ def _measure_gradients(
             estimator is best.
         chooses_spp: whether a full measurement may choose the samples per pixel.
     """
-    renderer = problem.renderer
-    progress = stages.progress
     # A quick measurement is too short to measure times: it counts renders.
     counts_renders = not full or deterministic
-    seed = seeds.derive_seed(problem.seed, "measure")
-    bench = Bench(
-        renderer=renderer,
-        loss=problem.compute_loss,
-        u=find_interior_point(renderer),
-        seed=seed,
-        spp=problem.search_spp,
-        tick=lambda samples: progress.advance(1),
-    )
-    n_gradients = planning.count_plan_gradients(renderer.plan, with_all=full)
-    if n_gradients:
-        hint = (
-            f"{n_gradients} gradients of {format_count(problem.search_spp, 'sample')} a "
-            "pixel; `measure=no` leaves it out"
-        )
-        stages.begin(
-            "setup", "measuring which gradients are best here", n_gradients, hint=hint
-        )
+    bench = _make_loss_bench(problem, stages)
+    _begin_measuring_gradients(problem, stages, with_all=full)
     problem.gradient_plan = planning.choose_estimators(
         bench, with_all=full, count_renders=counts_renders
     )
@@ -204,6 +230,40 @@ def _measure_gradients(
         spp = _choose_gradient_steps(problem, bench, stages)
         if chooses_spp and spp is not None:
             problem.search_spp = spp
+
+
+def _begin_measuring_gradients(
+    problem: Problem, stages: Stages, *, with_all: bool
+) -> None:
+    """Begin the stage in which gradient estimators are measured, if any are.
+
+    Args:
+        problem: problem of the attack.
+        stages: stages of the run.
+        with_all: whether all estimators are measured, and not only contested ones.
+    """
+    n_gradients = planning.count_plan_gradients(
+        problem.renderer.plan, with_all=with_all
+    )
+    if n_gradients:
+        samples = format_count(problem.search_spp, "sample")
+        hint = (
+            f"{n_gradients} gradients of {samples} a pixel; `measure=no` leaves it out"
+        )
+        title = "measuring which gradients are best here"
+        stages.begin("setup", title, n_gradients, hint=hint)
+
+
+def _make_loss_bench(problem: Problem, stages: Stages) -> Bench:
+    """Return what measures gradients of a problem's loss, and reports each."""
+    return Bench(
+        renderer=problem.renderer,
+        loss=problem.compute_loss,
+        u=find_interior_point(problem.renderer),
+        seed=seeds.derive_seed(problem.seed, "measure"),
+        spp=problem.search_spp,
+        tick=lambda samples: stages.progress.advance(1),
+    )
 
 
 def _choose_gradient_steps(
@@ -222,13 +282,9 @@ def _choose_gradient_steps(
     # Gradients of several steps and sample counts are compared by their cosine with a
     # reference. Progress is counted in samples, since the sample counts differ.
     samples = planning.count_cosine_samples(problem.gradient_plan)
-    stages.begin(
-        "setup",
-        "choosing step and samples of gradients",
-        samples,
-        hint="counted in samples a pixel; `measure=quick` leaves it out",
-        at_most=True,
-    )
+    title = "choosing step and samples of gradients"
+    hint = "counted in samples a pixel; `measure=quick` leaves it out"
+    stages.begin("setup", title, samples, hint=hint, at_most=True)
     cosine_bench = replace(bench, tick=stages.progress.advance)
     table = list(planning.measure_cosines(cosine_bench))
     problem.gradient_plan, spp = planning.choose_steps(problem.gradient_plan, table)
@@ -280,14 +336,18 @@ def is_already_wrong(verifier: Verifier, *, in_any_case: bool) -> bool:
     was_right_once = any(trial.right for trial in findings.first_look_trials)
     if was_right_once and not in_any_case:
         return False
-    verifier.choose_spp({"clean": problem.domain.start})
+    _try_clean_scene(verifier)
+    counts = count_right(findings.clean_trials, findings.spp)
+    return problem.verification_rule.is_already_wrong(counts)
+
+
+def _try_clean_scene(verifier: Verifier) -> None:
+    """Choose the samples per pixel for the clean scene, and make its trials."""
+    verifier.choose_spp({"clean": verifier.problem.domain.start})
     # trials after which a verdict is first possible
     min_trials = verifier.look_sizes[0]
     verifier.begin_stage("checking the clean scene with fresh renders", min_trials)
     verifier.run_clean_trials()
-    return problem.verification_rule.is_already_wrong(
-        count_right(findings.clean_trials, findings.spp)
-    )
 
 
 def choose_predictor(
@@ -321,24 +381,18 @@ def choose_predictor(
         step is rendered in full.
     """
     problem = journal.problem
-    steps = problem.steps
-    matrix_refusal = find_matrix_refusal(problem, steps, specialise)
+    matrix_refusal = find_matrix_refusal(problem, problem.steps, specialise)
     surface_refusal = surface_light.find_surface_light_refusal(
-        problem, steps, policy, specialise
+        problem, problem.steps, policy, specialise
     )
     can_use_matrices = matrix_refusal is None
     can_use_surface_light = surface_refusal is None
-
-    candidates: list[Callable[[], PredictedSearch]] = []  # cheapest first
-    if can_use_matrices and problem.conditions is None:
-        # a single matrix predicts all images, if no condition varies
-        candidates.append(lambda: Transport(problem, steps, clean_matrix=clean))
-    else:
-        if can_use_surface_light:
-            candidates.append(lambda: SurfaceLight(problem, steps))
-        if can_use_matrices:
-            candidates.append(lambda: Bank(problem, steps, journal.evaluator))
-
+    candidates = _list_candidates(
+        journal,
+        clean,
+        can_use_matrices=can_use_matrices,
+        can_use_surface_light=can_use_surface_light,
+    )
     for make_predictor in candidates:
         predictor = make_predictor()
         refusal = _prepare(predictor, stages)
@@ -349,22 +403,74 @@ def choose_predictor(
         # It is light on surfaces: matrices are never refused for their accuracy here.
         surface_refusal = refusal
         findings.surface_light_refusal = refusal
-        # The next candidate, if there is one, is the bank of matrices.
-        instead = "predicted by matrices" if can_use_matrices else "rendered"
-        stages.progress.message(f"Pictures are {instead}: {refusal}.")
+        _report_inaccuracy(refusal, stages, can_use_matrices=can_use_matrices)
 
     # If matrices could be used, the loop has returned. Light on surfaces was refused
     # before the loop or in it.
     assert matrix_refusal is not None and surface_refusal is not None
-    refusal = surface_refusal
-    if _is_matrix_refusal_more_helpful(
+    reports_matrix_refusal = _is_matrix_refusal_more_helpful(
         problem, surface_refusal, findings, specialise=specialise
-    ):
-        refusal = matrix_refusal
+    )
+    refusal = matrix_refusal if reports_matrix_refusal else surface_refusal
+    return _render_search(problem, refusal, stages, findings, specialise=specialise)
+
+
+def _render_search(
+    problem: Problem,
+    refusal: Refusal,
+    stages: Stages,
+    findings: RunState,
+    *,
+    specialise: bool,
+) -> PredictedSearch | None:
+    """Prepare a search whose images are rendered, in part if renders may be cropped.
+
+    See `_crop_search` for the other arguments and for what is returned.
+
+    Args:
+        specialise: whether renders may leave out what the search does not need.
+    """
     if not specialise:
         _report_rendering(refusal, stages, findings)
         return None
     return _crop_search(problem, refusal, stages, findings)
+
+
+def _report_inaccuracy(
+    refusal: Refusal, stages: Stages, *, can_use_matrices: bool
+) -> None:
+    """Report that light on surfaces is too inaccurate, and what replaces it."""
+    # The next candidate, if there is one, is the bank of matrices.
+    instead = "predicted by matrices" if can_use_matrices else "rendered"
+    stages.progress.message(f"Pictures are {instead}: {refusal}.")
+
+
+def _list_candidates(
+    journal: Journal,
+    clean: CleanMatrix,
+    *,
+    can_use_matrices: bool,
+    can_use_surface_light: bool,
+) -> list[Callable[[], PredictedSearch]]:
+    """Return the functions that make the usable predictors, the cheapest first.
+
+    Args:
+        journal: journal of the run.
+        clean: the matrix of light transport of the clean scene, which attacks may share.
+        can_use_matrices: whether nothing speaks against matrices of light transport.
+        can_use_surface_light: whether nothing speaks against light on surfaces.
+    """
+    problem = journal.problem
+    steps = problem.steps
+    if can_use_matrices and problem.conditions is None:
+        # a single matrix predicts all images, if no condition varies
+        return [lambda: Transport(problem, steps, clean_matrix=clean)]
+    candidates: list[Callable[[], PredictedSearch]] = []
+    if can_use_surface_light:
+        candidates.append(lambda: SurfaceLight(problem, steps))
+    if can_use_matrices:
+        candidates.append(lambda: Bank(problem, steps, journal.evaluator))
+    return candidates
 
 
 def _is_matrix_refusal_more_helpful(
@@ -482,16 +588,21 @@ class Searches:
         )
         samples = format_count(self.problem.search_spp, "sample")
         hint = f"{n_renders} pictures of {samples} a pixel; {shorter}"
-        predictor = self.run_state.predictor
-        # The hint assumes that every search is predicted if the main one is ("search").
-        is_predicted = predictor is not None and bool(
-            predictor.count_predicted("search", steps)
-        )
-        if is_predicted:
+        if self._is_predicted(steps):
             # A search ends with a ranking of the best configurations, always rendered.
             n_rendered = n_renders - steps
             hint = f"{steps} pictures predicted and {n_rendered} traced; {shorter}"
         self.stages.begin(name, title, n_renders, hint=hint, at_most=True)
+
+    def _is_predicted(self, steps: int) -> bool:
+        """Return whether images of a search of some steps are predicted.
+
+        It is assumed that every search is predicted if the main one, "search", is.
+        """
+        predictor = self.run_state.predictor
+        return predictor is not None and bool(
+            predictor.count_predicted("search", steps)
+        )
 
     def _mark_domain(self, domain: Domain, policy: Policy[Any]) -> Domain:
         """Return the domain, marked with what its evaluations are like.
@@ -556,13 +667,20 @@ class Searches:
             kind=kind,
             render_seed=self.problem.seed,
         )
-        if result.ending is Ending.INTERRUPTED:
-            # The first search is the main one. The result of a later search that was
-            # interrupted is dropped.
-            if self.run_state.search_result is None:
-                self.run_state.search_result = result
-            raise KeyboardInterrupt
+        self._check_not_interrupted(result)
         return result
+
+    def _check_not_interrupted(self, result: SearchResult) -> None:
+        """Raise `KeyboardInterrupt` if a search was interrupted, and store its result.
+
+        The first search is the main one. The result of a later search that was
+        interrupted is dropped.
+        """
+        if result.ending is not Ending.INTERRUPTED:
+            return
+        if self.run_state.search_result is None:
+            self.run_state.search_result = result
+        raise KeyboardInterrupt
 
     def _make_evaluate(
         self, steps: int, *, has_frames: bool
@@ -579,19 +697,11 @@ class Searches:
         frame_interval = max(1, math.ceil(steps / MAX_FRAMES))
         predictor = self.run_state.predictor
 
-        def request_image(query: Query) -> Query:
-            """Return the query, with a request for an image if its step has one."""
-            is_due = query.phase == "search" and query.row_index % frame_interval == 0
-            return replace(query, includes_image=is_due)
-
-        def ignore_replay(query: Query) -> None:
-            """Do nothing: rendering has no state that stored evaluations change."""
-
         def evaluate(queries: Sequence[Query]) -> Iterator[Evaluation]:
             """Evaluate queries, or replay what is stored of them."""
             if has_frames:
-                queries = [request_image(query) for query in queries]
-            on_replay = ignore_replay if predictor is None else predictor.replay
+                queries = [_request_frame(query, frame_interval) for query in queries]
+            on_replay = _ignore_replay if predictor is None else predictor.replay
             return self.journal.evaluate_all(queries, self._evaluate, on_replay)
 
         return evaluate
@@ -629,15 +739,7 @@ class Searches:
         Args:
             queries: queries of a single phase, "search" or "ranking".
         """
-        evaluate_rendered = self.journal.evaluator
-        predictor = self.run_state.predictor
-        if predictor is None or not queries:
-            evaluations = evaluate_rendered(queries)
-        elif queries[0].phase == "ranking":
-            evaluations = predictor.rank_all(queries, evaluate_rendered)
-        else:
-            # It renders, too: to check its predictions, and after it was given up.
-            evaluations = predictor.evaluate_all(queries, evaluate_rendered)
+        evaluations = self._evaluate_objectives(queries)
         for query, evaluation in zip(queries, evaluations, strict=True):
             # `UNPRINTED` is the kind of the search that measures what the terms cost
             has_print_terms = self.printable and query.kind != UNPRINTED
@@ -645,6 +747,32 @@ class Searches:
                 space = self.problem.searched_space
                 evaluation = subtract_print_penalty(evaluation, space, query.u)
             yield evaluation
+
+    def _evaluate_objectives(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
+        """Evaluate queries of a single phase, without print terms."""
+        evaluate_rendered = self.journal.evaluator
+        predictor = self.run_state.predictor
+        if predictor is None or not queries:
+            return evaluate_rendered(queries)
+        if queries[0].phase == "ranking":
+            return predictor.rank_all(queries, evaluate_rendered)
+        # It renders, too: to check its predictions, and after it was given up.
+        return predictor.evaluate_all(queries, evaluate_rendered)
+
+
+def _request_frame(query: Query, interval: int) -> Query:
+    """Return a query, with a request for an image if its step has a frame.
+
+    Args:
+        query: the query.
+        interval: steps from one image to the next.
+    """
+    is_due = query.phase == "search" and query.row_index % interval == 0
+    return replace(query, includes_image=is_due)
+
+
+def _ignore_replay(query: Query) -> None:
+    """Do nothing: rendering has no state that stored evaluations change."""
 
 
 def _choose_verification_samples(
@@ -688,51 +816,94 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
     findings = verifier.run_state
     candidate = findings.search_result
     baseline = findings.random_search_result
-    unprinted = findings.result_without_print_terms
     if candidate is None:
         raise RuntimeError("nothing was searched, so there is nothing to verify")
-    adversarial = verifier.problem.domain.project(candidate.best_u)
-    results = [
-        result for result in (candidate, baseline, unprinted) if result is not None
-    ]
+    results = _list_results(findings)
     keeps_sample_count = is_smallest and findings.sample_count is not None
     if not keeps_sample_count:
+        adversarial = verifier.problem.domain.project(candidate.best_u)
         _choose_verification_samples(verifier, results, adversarial)
-    # Groups of trials in this stage, one for each configuration. Failures and ambient
-    # light have stages of their own.
-    n_groups = len(results)
-    if not verifier.has_clean_trials:
-        n_groups += 1
-    verifier.begin_stage(
-        "checking what was found with fresh renders",
-        n_groups * verifier.n_trials,
-        at_most=True,
-    )
+    _begin_verification(verifier, len(results))
     verifier.run_clean_trials()
     findings.verification = verifier.verify("verification", candidate)
-    if findings.verification.ending is Ending.ALREADY_WRONG:
-        # The model is wrong about the clean scene at this sample count, which is not
-        # that of the search. So no change is needed, and bounds of the smallest change
-        # mean nothing.
-        findings.smallest_change_bracket = None
-    if unprinted is not None:
-        findings.unprinted_verification = verifier.verify(
-            "unprinted verification", unprinted
-        )
+    _drop_meaningless_bracket(findings)
+    _verify_unprinted(verifier)
     if baseline is not None:
-        # Curtailed trials end as soon as the verdict is certain. If the policy's result
-        # is verified, the exact rate of the random search's result is not needed.
-        is_policy_verified = findings.verification.ending is Ending.FOUND
-        findings.baseline_verification = verifier.verify(
-            "baseline verification", baseline, curtailed=is_policy_verified
-        )
-        _replace_if_random_is_worse(verifier, candidate, baseline)
+        _verify_baseline(verifier, candidate, baseline)
     if not is_smallest:
         verify_failures(verifier, candidate)
-    # read again: `_replace_if_random_is_worse` may have replaced it
+    # read again: `_verify_baseline` may have replaced it
     verification = findings.verification
     if verification.ending is Ending.FOUND:
         find_ambient(verifier, verification.u)
+
+
+def _drop_meaningless_bracket(findings: RunState) -> None:
+    """Drop the bounds of the smallest change if the clean scene is wrong already.
+
+    The verification has another sample count than the search. If the model is wrong
+    about the clean scene at this count, no change is needed, and the bounds mean
+    nothing.
+    """
+    verification = findings.verification
+    if verification is not None and verification.ending is Ending.ALREADY_WRONG:
+        findings.smallest_change_bracket = None
+
+
+def _list_results(findings: RunState) -> list[SearchResult]:
+    """Return the results of the searches that were made."""
+    results = (
+        findings.search_result,
+        findings.random_search_result,
+        findings.result_without_print_terms,
+    )
+    return [result for result in results if result is not None]
+
+
+def _begin_verification(verifier: Verifier, n_results: int) -> None:
+    """Begin the stage in which the results of searches are verified.
+
+    It has a group of trials for each configuration. Failures and ambient light have
+    stages of their own.
+    """
+    n_groups = n_results
+    if not verifier.has_clean_trials:
+        n_groups += 1
+    title = "checking what was found with fresh renders"
+    verifier.begin_stage(title, n_groups * verifier.n_trials, at_most=True)
+
+
+def _verify_unprinted(verifier: Verifier) -> None:
+    """Verify the result of the search without print terms, if there was one."""
+    findings = verifier.run_state
+    unprinted = findings.result_without_print_terms
+    if unprinted is not None:
+        kind = "unprinted verification"
+        findings.unprinted_verification = verifier.verify(kind, unprinted)
+
+
+def _verify_baseline(
+    verifier: Verifier, candidate: SearchResult, baseline: SearchResult
+) -> None:
+    """Verify the result of the random search, which may replace that of the policy.
+
+    Args:
+        verifier: verifier of the attack, whose state has the verification of the
+            policy's result.
+        candidate: result of the policy's search.
+        baseline: result of the random search.
+    """
+    findings = verifier.run_state
+    # Curtailed trials end as soon as the verdict is certain. If the policy's result is
+    # verified, the exact rate of the random search's result is not needed.
+    verification = findings.verification
+    is_policy_verified = verification is not None and (
+        verification.ending is Ending.FOUND
+    )
+    findings.baseline_verification = verifier.verify(
+        "baseline verification", baseline, curtailed=is_policy_verified
+    )
+    _replace_if_random_is_worse(verifier, candidate, baseline)
 
 
 def _replace_if_random_is_worse(
@@ -754,9 +925,8 @@ def _replace_if_random_is_worse(
     random_verification = findings.baseline_verification
     if policy_verification is None or random_verification is None:
         return
-    if random_verification.ending is not Ending.FOUND:
-        return
-    if _rank(random_verification) <= _rank(policy_verification):
+    is_found = random_verification.ending is Ending.FOUND
+    if not is_found or _rank(random_verification) <= _rank(policy_verification):
         return
     # twice the trials: of the configuration, and of the clean scene with their seeds
     title = "checking what the random search found again"
@@ -768,15 +938,19 @@ def _replace_if_random_is_worse(
     if _rank(random_verification) > _rank(policy_verification):
         findings.outdone_verification = policy_verification
         findings.verification = random_verification
-        # what the random search found, with the policy's history and counts
-        findings.search_result = replace(
-            result,
-            best_u=baseline.best_u,
-            best_objective=baseline.best_objective,
-            claimed_objective=baseline.claimed_objective,
-            success_rate=baseline.success_rate,
-            distribution=None,
-        )
+        findings.search_result = _merge_random_result(result, baseline)
+
+
+def _merge_random_result(result: SearchResult, baseline: SearchResult) -> SearchResult:
+    """Return what the random search found, with the policy's history and counts."""
+    return replace(
+        result,
+        best_u=baseline.best_u,
+        best_objective=baseline.best_objective,
+        claimed_objective=baseline.claimed_objective,
+        success_rate=baseline.success_rate,
+        distribution=None,
+    )
 
 
 MIN_CONFIRMING_TRIALS = 40
@@ -803,58 +977,89 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
     """
     problem = searches.problem
     findings = searches.run_state
-    n_trials = verifier.n_trials
-    max_failures = problem.verification_rule.count_allowed_failures(n_trials)
-    results: list[SearchResult] = []
-    # A matrix of light transport predicts scores without noise. By them it estimates
-    # which configurations are likely to pass. The scores of trials correct its bias.
-    transport = None
-    is_likely = None
-    if isinstance(findings.predictor, Transport):
-        transport = findings.predictor
-        is_likely = transport.is_likely_success
+    smallest_search = _SmallestSearch(searches, policy, verifier)
+    transport = smallest_search.transport
+    bracket = find_smallest_change(
+        smallest_search.search_inside,
+        smallest_search.passes_short_check,
+        problem.domain,
+        likely=None if transport is None else transport.is_likely_success,
+    )
+    bracket = _confirm(
+        bracket, smallest_search.passes_full_check, verifier, problem.domain
+    )
+    findings.smallest_change_bracket = bracket
+    findings.search_result = _combine_results(smallest_search.results, bracket)
 
-    def search_inside(domain: Domain, number: int) -> Tensor:
+
+@dataclass
+class _SmallestSearch:
+    """The searches and the checks by which the smallest change is found.
+
+    Attributes:
+        searches: searches of the attack.
+        policy: policy that searches.
+        verifier: verifier that tries what was found.
+        results: results of the searches so far.
+    """
+
+    searches: Searches
+    policy: Policy[Any]
+    verifier: Verifier
+    results: list[SearchResult] = field(default_factory=list)
+
+    @property
+    def transport(self) -> Transport | None:
+        """The matrix of light transport that predicts the images; None without one.
+
+        It predicts scores without noise. By them it estimates which configurations are
+        likely to pass. The scores of trials correct its bias.
+        """
+        predictor = self.searches.run_state.predictor
+        return predictor if isinstance(predictor, Transport) else None
+
+    def search_inside(self, domain: Domain, number: int) -> Tensor:
         """Search a smaller domain, and return the best configuration (d,)."""
-        result = _search_budget(searches, policy, domain, number)
-        results.append(result)
+        findings = self.searches.run_state
+        result = _search_budget(self.searches, self.policy, domain, number)
+        self.results.append(result)
         # The first result is that of the attack until a configuration passes a check:
         # the attack may be interrupted before.
         if findings.search_result is None:
             findings.search_result = result
-        verifier.begin_stage(
-            "trying smaller changes", MAX_CHECKS * n_trials, at_most=True
-        )
+        n_trials = MAX_CHECKS * self.verifier.n_trials
+        self.verifier.begin_stage("trying smaller changes", n_trials, at_most=True)
         return result.best_u
 
-    def passes_check(u: Tensor, check_index: int, min_trials: int = n_trials) -> bool:
-        """Return whether a configuration (d,) passes a check, by default a full one.
+    def passes_short_check(self, u: Tensor, check_index: int) -> bool:
+        """Return whether a configuration (d,) passes a check that may end early."""
+        min_trials = self.searches.problem.verification_rule.min_trials
+        return self._passes_check(u, check_index, min_trials)
 
-        If it passes, it is stored as the result of the attack so far.
+    def passes_full_check(self, u: Tensor, check_index: int) -> bool:
+        """Return whether a configuration (d,) passes a check with all trials."""
+        return self._passes_check(u, check_index, self.verifier.n_trials)
+
+    def _passes_check(self, u: Tensor, check_index: int, min_trials: int) -> bool:
+        """Return whether a configuration passes a check, and store it if it does.
+
+        Args:
+            u: (d,) the configuration.
+            check_index: index of the check, which decides the seeds of its trials.
+            min_trials: number of trials that suffices if none fails.
         """
+        rule = self.searches.problem.verification_rule
+        max_failures = rule.count_allowed_failures(self.verifier.n_trials)
         scores, has_passed = _try_until_decided(
-            verifier, u, check_index, min_trials, max_failures
+            self.verifier, u, check_index, min_trials, max_failures
         )
-        if transport is not None:
-            transport.update_score_bias(u, scores)
+        if self.transport is not None:
+            self.transport.update_score_bias(u, scores)
         if has_passed:
             # The other fields are those of the last search, until the end of
             # `find_smallest`. This result is used only after an interrupt.
-            findings.search_result = replace(results[-1], best_u=u)
+            self.searches.run_state.search_result = replace(self.results[-1], best_u=u)
         return has_passed
-
-    def passes_short_check(u: Tensor, check_index: int) -> bool:
-        """Return whether a configuration (d,) passes a check that may end early."""
-        return passes_check(
-            u, check_index, min_trials=problem.verification_rule.min_trials
-        )
-
-    bracket = find_smallest_change(
-        search_inside, passes_short_check, problem.domain, likely=is_likely
-    )
-    bracket = _confirm(bracket, passes_check, verifier, problem.domain)
-    findings.smallest_change_bracket = bracket
-    findings.search_result = _combine_results(results, bracket)
 
 
 def _search_budget(
@@ -908,11 +1113,8 @@ def _confirm(
     # full checks that together have at least `MIN_CONFIRMING_TRIALS` trials
     n_checks = math.ceil(MIN_CONFIRMING_TRIALS / verifier.n_trials)
     if bracket.u is not None:
-        verifier.begin_stage(
-            "checking the smallest change",
-            MAX_CONFIRMATIONS * n_checks * verifier.n_trials,
-            at_most=True,
-        )
+        n_trials = MAX_CONFIRMATIONS * n_checks * verifier.n_trials
+        verifier.begin_stage("checking the smallest change", n_trials, at_most=True)
     return confirm_bracket(bracket, passes_check, domain, times=n_checks)
 
 
@@ -999,26 +1201,29 @@ def verify_failures(verifier: Verifier, result: SearchResult) -> None:
         verifier: verifier of the attack.
         result: result of the search.
     """
-    problem = verifier.problem
-    findings = verifier.run_state
     known = result.failures
-    rule = problem.verification_rule
-    if known is None or not known.examples or rule.has_varying_conditions:
-        return
-    # If the model is wrong about the clean scene, a failure proves nothing. Only the
-    # counts matter here, and not the `spp` that is stored with them.
-    clean_counts = count_right(findings.clean_trials, spp=1)
-    if rule.is_already_wrong(clean_counts):
+    if known is None or not known.examples or not _can_verify_failures(verifier):
         return
     failures = known.examples[:MAX_TRIED_FAILURES]
-    verifier.begin_stage(
-        "checking different failures with fresh renders",
-        len(failures) * verifier.n_trials,
-        at_most=True,
-    )
-    findings.failure_verifications = tuple(
+    title = "checking different failures with fresh renders"
+    verifier.begin_stage(title, len(failures) * verifier.n_trials, at_most=True)
+    verifier.run_state.failure_verifications = tuple(
         verifier.verify(
             f"failure {number}", replace(result, best_u=failure.u), curtailed=True
         )
         for number, failure in enumerate(failures)
     )
+
+
+def _can_verify_failures(verifier: Verifier) -> bool:
+    """Return whether trials of single failures can prove anything at a bearable cost.
+
+    They cannot if conditions vary by chance, or if the model is wrong about the clean
+    scene.
+    """
+    rule = verifier.problem.verification_rule
+    if rule.has_varying_conditions:
+        return False
+    # Only the counts matter here, and not the `spp` that is stored with them.
+    clean_counts = count_right(verifier.run_state.clean_trials, spp=1)
+    return not rule.is_already_wrong(clean_counts)

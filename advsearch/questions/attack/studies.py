@@ -12,7 +12,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks.verification import WORST_CASE
-from advsearch.cluster import BatchFunction, BatchResult, WorkerTask
+from advsearch.cluster import BatchFunction, BatchResult, Workers, WorkerTask
 from advsearch.cluster.workers import open_workers
 from advsearch.engine.journal import make_worker_call
 from advsearch.engine.judging import find_label_warnings
@@ -131,26 +131,34 @@ def _curve_chains(config: AttackConfig) -> list[Chain]:
     """Return the attacks of each object, with the smallest epsilon first."""
     # None if there is no list of epsilons: then `config.epsilon` stays as it is.
     epsilons: list[float | None] = [*sorted(config.epsilons)] or [None]
-    chains: list[Chain] = []
-    for index, name in enumerate(check_distinct(config.objects, "object")):
-        chain: Chain = []
-        for epsilon in epsilons:
-            name_parts = []
-            if epsilon is not None:
-                name_parts = [f"epsilon {epsilon:g}".replace(".", "_")]
-            attack_config = AttackConfig.from_config(
-                config,
-                object=name,
-                epsilon=config.epsilon if epsilon is None else epsilon,
-            )
-            directory = f"{index:02d}-" + make_default_name(name, name_parts)
-            chain.append(
-                StudyAttack(
-                    attack_config, directory, object_or_model=name, epsilon=epsilon
-                )
-            )
-        chains.append(chain)
-    return chains
+    names = check_distinct(config.objects, "object")
+    return [
+        [_make_curve_attack(config, index, name, epsilon) for epsilon in epsilons]
+        for index, name in enumerate(names)
+    ]
+
+
+def _make_curve_attack(
+    config: AttackConfig, index: int, name: str, epsilon: float | None
+) -> StudyAttack:
+    """Return the attack on an object with an epsilon.
+
+    Args:
+        config: settings of the study.
+        index: index of the object among all objects.
+        name: name of the object.
+        epsilon: the epsilon; None for that of the settings.
+    """
+    name_parts = []
+    if epsilon is not None:
+        name_parts = [f"epsilon {epsilon:g}".replace(".", "_")]
+    attack_config = AttackConfig.from_config(
+        config,
+        object=name,
+        epsilon=config.epsilon if epsilon is None else epsilon,
+    )
+    directory = f"{index:02d}-" + make_default_name(name, name_parts)
+    return StudyAttack(attack_config, directory, object_or_model=name, epsilon=epsilon)
 
 
 def make_chain_worker(settings: JsonObject) -> BatchFunction:
@@ -163,26 +171,29 @@ def make_chain_worker(settings: JsonObject) -> BatchFunction:
     Args:
         settings: settings of the study.
     """
-    chains = make_chains(AttackConfig(**settings))
+    return partial(_run_chain, make_chains(AttackConfig(**settings)))
 
-    def run_chain(batch: Sequence[int]) -> list[tuple[str, str, dict[str, bytes]]]:
-        """Make the attacks of the chain whose index is the only item of the batch."""
-        finished = []
-        clean = CleanMatrix()  # shared by the attacks, which have the same clean scene
-        (chain_index,) = batch
-        with tempfile.TemporaryDirectory(prefix="advsearch-part-") as directory:
-            for study_attack in chains[chain_index]:
-                path = Path(directory) / study_attack.name
-                config = study_attack.config.model_copy(
-                    update={"run": str(path), "overwrite": True}
-                )
-                ending = attack_once(config, clean=clean).summary.ending
-                finished.append((study_attack.name, str(path), _read_files(path)))
-                if ending in SETTLED:
-                    break  # the attacks with larger epsilons are not needed
-        return finished
 
-    return run_chain
+def _run_chain(
+    chains: Sequence[Chain], batch: Sequence[int]
+) -> list[tuple[str, str, dict[str, bytes]]]:
+    """Make the attacks of the chain whose index is the only item of a batch.
+
+    See `make_chain_worker` for what is returned.
+    """
+    finished = []
+    clean = CleanMatrix()  # shared by the attacks, which have the same clean scene
+    (chain_index,) = batch
+    with tempfile.TemporaryDirectory(prefix="advsearch-part-") as directory:
+        for study_attack in chains[chain_index]:
+            path = Path(directory) / study_attack.name
+            changes = {"run": str(path), "overwrite": True}
+            config = study_attack.config.model_copy(update=changes)
+            ending = attack_once(config, clean=clean).summary.ending
+            finished.append((study_attack.name, str(path), _read_files(path)))
+            if ending in SETTLED:
+                break  # the attacks with larger epsilons are not needed
+    return finished
 
 
 def _read_files(directory: Path) -> dict[str, bytes]:
@@ -211,22 +222,9 @@ def distribute_attacks(
     Raises:
         ClusterError: every worker that tried an attack died, or no worker is left.
     """
-    missing_chains = [
-        index
-        for index, chain in enumerate(chains)
-        if not any(is_run(run / PARTS / attack.name) for attack in chain)
-    ]
-    in_process = {"workers": None, "cluster": None}  # workers start no workers
-    worker_settings = config.make_repeatable().model_copy(update=in_process).to_json()
-    work = WorkerTask(
-        "advsearch.questions.attack.studies:make_chain_worker",
-        worker_settings,
-        path_setting_names=FILES,
-        threads=config.n_used_threads or 1,
-        min_timeout_seconds=MAX_ATTACK_SECONDS,
-    )
+    missing_chains = _find_missing_chains(chains, run)
     with open_workers(
-        work,
+        _make_study_task(config),
         # without work no workers are started
         workers=config.workers if missing_chains else None,
         cluster=config.cluster if missing_chains else None,
@@ -241,9 +239,36 @@ def distribute_attacks(
             _check_not_lost(chains, result)
             for name, worker_path, files in result.value:
                 _write_part(run, name, worker_path, files)
-            stats = executor.stats
-            worker_counts = {} if stats is None else {"workers": stats.workers}
-            progress.advance(1, **worker_counts)
+            _report_chain(executor, progress)
+
+
+def _find_missing_chains(chains: Sequence[Chain], run: Path) -> list[int]:
+    """Return the indices of the chains of which no attack has begun in a run directory."""
+    return [
+        index
+        for index, chain in enumerate(chains)
+        if not any(is_run(run / PARTS / attack.name) for attack in chain)
+    ]
+
+
+def _report_chain(executor: Workers, progress: Progress) -> None:
+    """Report that the attacks of a chain are done, and how many workers there are."""
+    stats = executor.stats
+    worker_counts = {} if stats is None else {"workers": stats.workers}
+    progress.advance(1, **worker_counts)
+
+
+def _make_study_task(config: AttackConfig) -> WorkerTask:
+    """Return how workers make the attacks of a study from its settings."""
+    in_process = {"workers": None, "cluster": None}  # workers start no workers
+    worker_settings = config.make_repeatable().model_copy(update=in_process).to_json()
+    return WorkerTask(
+        "advsearch.questions.attack.studies:make_chain_worker",
+        worker_settings,
+        path_setting_names=FILES,
+        threads=config.n_used_threads or 1,
+        min_timeout_seconds=MAX_ATTACK_SECONDS,
+    )
 
 
 def _check_not_lost(chains: Sequence[Chain], result: BatchResult) -> None:
@@ -341,9 +366,19 @@ class StudyRun:
         """
         if self.interrupted:
             return None
-        config = attack.config
-        path = self.run.path / PARTS / attack.name
         self.names.append(attack.name)
+        self._report_attack(attack.config)
+        summary = self._make_or_read(attack, clean)
+        self.warnings += [
+            text for text in summary.warnings if text not in self.warnings
+        ]
+        if summary.ending == INTERRUPTED:
+            self.context.ending = INTERRUPTED  # the study is interrupted, too
+            return None
+        return summary
+
+    def _report_attack(self, config: AttackConfig) -> None:
+        """Report which attack is made now."""
         # None and a mapping by control are not reported.
         budget = ""
         if isinstance(config.epsilon, float):
@@ -354,23 +389,17 @@ class StudyRun:
             f"{config.model}, {' and '.join(config.controls)}{budget}"
         )
 
-        def attack_with_matrix(
-            part_config: AttackConfig, **options: Any
-        ) -> AttackSummary:
-            """Make the attack with the shared matrix, and return its result."""
-            return attack_once(part_config, clean=clean, **options).summary
-
-        summary = run_part(path, config, self.progress, attack_with_matrix)
+    def _make_or_read(
+        self, attack: StudyAttack, clean: CleanMatrix | None
+    ) -> AttackSummary:
+        """Make an attack, or read its result if it is done; see `run_attack`."""
+        path = self.run.path / PARTS / attack.name
+        make_attack = partial(_attack_with_matrix, clean)
+        summary = run_part(path, attack.config, self.progress, make_attack)
         if not isinstance(summary, AttackSummary):
             raise FileFormatError(
                 f"{path}: expected the run of an attack, got one of {summary.command}"
             )
-        self.warnings += [
-            text for text in summary.warnings if text not in self.warnings
-        ]
-        if summary.ending == INTERRUPTED:
-            self.context.ending = INTERRUPTED  # the study is interrupted, too
-            return None
         return summary
 
     def make_result(self, kind: type[ResultType], **fields: Any) -> ResultType:
@@ -383,6 +412,20 @@ class StudyRun:
         return self.context.result(
             kind, parts=self.names, warnings=self.warnings, **fields
         )
+
+
+def _attack_with_matrix(
+    clean: CleanMatrix | None, config: AttackConfig, **options: Any
+) -> AttackSummary:
+    """Make an attack, and return its result.
+
+    Args:
+        clean: the matrix of light transport of the clean scene, shared with other
+            attacks; None to share none.
+        config: settings of the attack.
+        **options: keywords of `attack_once`.
+    """
+    return attack_once(config, clean=clean, **options).summary
 
 
 def _find_label_warnings(config: AttackConfig) -> list[str]:
@@ -436,28 +479,41 @@ def _attack_object(study: StudyRun, chain: Chain) -> ObjectRow:
         if summary is None:  # interrupted
             break
         renders.update(summary.renders)
-        # Without an epsilon of the curve, each control has its own, which may be a
-        # mapping by control.
-        epsilon = summary.epsilon if attack.epsilon is None else attack.epsilon
-        margin = None
-        if summary.verified is not None:
-            margin = summary.verified.margin
-        row = ObjectRow(
-            object=attack.object_or_model,
-            clean=summary.clean.control,
-            ending=summary.ending,
-            epsilon=epsilon,
-            flips_at=epsilon if summary.ending == "found" else None,
-            verified=summary.verified,
-            margin=margin,
-            run=summary.run,
-            tried=attack.epsilon,  # the epsilon of the curve only
-            average=summary.average,
-            renders=dict(renders),
-        )
+        row = _make_object_row(attack, summary, renders)
         if row.ending in SETTLED:
             break
     return row
+
+
+def _make_object_row(
+    attack: StudyAttack, summary: AttackSummary, renders: Mapping[str, int]
+) -> ObjectRow:
+    """Return the row of an object after an attack.
+
+    Args:
+        attack: the attack.
+        summary: its result.
+        renders: renders of all attacks on the object so far, by what they are for.
+    """
+    # Without an epsilon of the curve, each control has its own, which may be a mapping
+    # by control.
+    epsilon = summary.epsilon if attack.epsilon is None else attack.epsilon
+    margin = None
+    if summary.verified is not None:
+        margin = summary.verified.margin
+    return ObjectRow(
+        object=attack.object_or_model,
+        clean=summary.clean.control,
+        ending=summary.ending,
+        epsilon=epsilon,
+        flips_at=epsilon if summary.ending == "found" else None,
+        verified=summary.verified,
+        margin=margin,
+        run=summary.run,
+        tried=attack.epsilon,  # the epsilon of the curve only
+        average=summary.average,
+        renders=dict(renders),
+    )
 
 
 def _is_known(row: ObjectRow, epsilon: float | None) -> bool:
@@ -500,19 +556,14 @@ def _compute_accuracy(rows: Sequence[ObjectRow], epsilon: float | None) -> Curve
     n_wrong = sum(row.ending == "already wrong" for row in known)
     n_found = sum(_has_flipped(row, epsilon) for row in known)
     n_robust = n_objects - n_wrong - n_found
-    accuracy = None
-    interval = (0.0, 1.0)
-    if known:
-        accuracy = n_robust / n_objects
-        interval = clopper_pearson(n_robust, n_objects)
     return CurvePoint(
         epsilon=epsilon,
         objects=n_objects,
         robust=n_robust,
         found=n_found,
         already_wrong=n_wrong,
-        accuracy=accuracy,
-        interval=interval,
+        accuracy=n_robust / n_objects if known else None,
+        interval=clopper_pearson(n_robust, n_objects) if known else (0.0, 1.0),
     )
 
 
@@ -553,13 +604,8 @@ def matrix(context: RunContext[AttackConfig]) -> MatrixResult:
     context.progress.stage(LOADING)
     for name in names:
         check_from_config(_with_model(config, name))  # raises before any attack
-
     study = StudyRun(context)
-    attacked = dict[str, AttackSummary]()
-    for (attack,) in study.chains:  # a chain of a matrix is a single attack
-        summary = study.run_attack(attack)
-        if summary is not None:  # None: not made, after an interrupt
-            attacked[attack.object_or_model] = summary
+    attacked = _attack_models(study)
     # `_try_on_models` fills these: an interrupt leaves what was done before it
     models: list[MatrixModel] = []
     cells: dict[str, list[MatrixCell]] = {}
@@ -568,7 +614,30 @@ def matrix(context: RunContext[AttackConfig]) -> MatrixResult:
         spp = config.verify_spp or _choose_trial_spp(attacked.values())
         with context.until_interrupted():
             _try_on_models(study, names, spp, configurations, models, cells)
-    rows = [
+    return study.make_result(
+        MatrixResult,
+        models=list(names),
+        ensemble=config.ensemble,
+        tested=models,
+        table=_list_matrix_rows(attacked, cells),
+    )
+
+
+def _attack_models(study: StudyRun) -> dict[str, AttackSummary]:
+    """Make the attacks of a matrix, and return their results by the attacked model."""
+    attacked = dict[str, AttackSummary]()
+    for (attack,) in study.chains:  # a chain of a matrix is a single attack
+        summary = study.run_attack(attack)
+        if summary is not None:  # None: not made, after an interrupt
+            attacked[attack.object_or_model] = summary
+    return attacked
+
+
+def _list_matrix_rows(
+    attacked: Mapping[str, AttackSummary], cells: Mapping[str, list[MatrixCell]]
+) -> list[MatrixRow]:
+    """Return the row of each attack, with its cells; both are by the attacked model."""
+    return [
         MatrixRow(
             attacked=name,
             ending=summary.ending,
@@ -578,13 +647,6 @@ def matrix(context: RunContext[AttackConfig]) -> MatrixResult:
         )
         for name, summary in attacked.items()
     ]
-    return study.make_result(
-        MatrixResult,
-        models=list(names),
-        ensemble=config.ensemble,
-        tested=models,
-        table=rows,
-    )
 
 
 def _read_configurations(attacked: Mapping[str, AttackSummary]) -> dict[str, Tensor]:
@@ -631,27 +693,45 @@ def _try_on_models(
     conditions = _make_conditions(names, spp, config)
     worker = "advsearch.questions.attack.studies:models_worker"
     with open_executor(config, worker, study.progress) as executor:
-        retrials = Retrials(
-            conditions,
-            study.run,
-            study.progress,
-            trials=config.trial_count,
-            seed=seeds.derive_seed(config.seed, "matrix"),
-            executor=executor,
-        )
-        n_predictions = config.trial_count * len(names)
-        hint = f"{n_predictions} predictions; `trials` or `verify_spp` shorten it"
-        title = "trying the clean scene on every model"
-        study.progress.stage(title, n_predictions, hint=hint)
+        retrials = _make_retrials(study, conditions, executor)
+        _begin_trials(study, "trying the clean scene on every model", len(names))
         for condition in conditions:
             models.append(_try_clean(retrials, condition))
         for name, u in configurations.items():
             title = f"trying the scene against {name} on every model"
-            study.progress.stage(title, n_predictions, hint=hint)
+            _begin_trials(study, title, len(names))
             cells[name] = [
                 _try_adversarial(retrials, name, u, condition)
                 for condition in conditions
             ]
+
+
+def _make_retrials(
+    study: StudyRun, conditions: Sequence[RetrialCondition], executor: Workers | None
+) -> Retrials:
+    """Return what makes the trials of a matrix.
+
+    Args:
+        study: study of the attacks.
+        conditions: what trials need of each model.
+        executor: makes the trials; None makes them in this process.
+    """
+    config = study.context.config
+    return Retrials(
+        conditions,
+        study.run,
+        study.progress,
+        trials=config.trial_count,
+        seed=seeds.derive_seed(config.seed, "matrix"),
+        executor=executor,
+    )
+
+
+def _begin_trials(study: StudyRun, title: str, n_models: int) -> None:
+    """Report that a scene is tried on all models."""
+    n_predictions = study.context.config.trial_count * n_models
+    hint = f"{n_predictions} predictions; `trials` or `verify_spp` shorten it"
+    study.progress.stage(title, n_predictions, hint=hint)
 
 
 def _make_conditions(

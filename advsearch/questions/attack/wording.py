@@ -7,10 +7,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import PurePath
 
 from advsearch.options import get_outcome
-from advsearch.questions.attack.summary import AttackSummary
+from advsearch.questions.attack.summary import AttackSummary, PathSegments
 from advsearch.report import wording as words
 from advsearch.report.wording import format_count, format_number
-from advsearch.runs.results import VerifiedRate
+from advsearch.runs.results import (
+    ControlGroup,
+    LinearTransport,
+    MovedValue,
+    PredictionError,
+    PrintTerms,
+    VerifiedRate,
+)
 
 PATH = "path"  # the control that moves along a path, at a random moment
 NORMS = {
@@ -48,26 +55,44 @@ def attack_verdict(summary: AttackSummary) -> str:
     this mug a vase in 20 of 20 fresh renders (...)". Else the text states that none was
     found, and why the search ended.
     """
-    ending = summary.ending
     verified = summary.verified
     thing = _name_thing(summary)
-    if ending == "already wrong":
-        wrong = words.format_mistake(
-            summary.task, thing, summary.clean.label, get_outcome(summary.clean.payload)
-        )
-        return (
-            f"The model already {wrong}: nothing was changed and nothing counts as "
-            "found."
-        )
+    if summary.ending == "already wrong":
+        return _already_wrong_verdict(summary, thing)
     if verified is None:
         return _unverified_verdict(summary, thing)
     has_paths = summary.drive is not None and len(summary.drive.paths) > 1
     rate = words.format_rate(verified) + condition_text(summary.over, has_paths)
     # "the model is wrong about this mug", "makes the model miss this mug"
     claim, goal = _clauses(summary, thing)
-    if ending == "found":
+    if summary.ending == "found":
         error = _error_clause(summary, verified, thing, claim)
         return f"{error} in {rate}.{_random_search_remark(summary, verified)}"
+    return _unsuccessful_verdict(summary, rate, claim, goal)
+
+
+def _already_wrong_verdict(summary: AttackSummary, thing: str) -> str:
+    """Return what a run found if the model is wrong about the clean scene."""
+    wrong = words.format_mistake(
+        summary.task, thing, summary.clean.label, get_outcome(summary.clean.payload)
+    )
+    return (
+        f"The model already {wrong}: nothing was changed and nothing counts as found."
+    )
+
+
+def _unsuccessful_verdict(
+    summary: AttackSummary, rate: str, claim: str, goal: str
+) -> str:
+    """Return what a run found that was verified, but did not find a failure.
+
+    Args:
+        summary: summary of the attack.
+        rate: the rate of the trials, and what differs between them.
+        claim: clause for what a success in a trial is.
+        goal: clause for the goal of the search.
+    """
+    ending = summary.ending
     if ending == "interrupted":
         return f"Interrupted; so far {claim} in {rate}."
     if ending == "not verified":
@@ -168,6 +193,15 @@ def _clean_remark(summary: AttackSummary) -> str:
     n_failures = control.trials - control.correct
     if not n_failures:
         return ""
+    failures = _clean_failures_text(control, summary)
+    return (
+        f"The clean scene itself fails {n_failures} of its {control.trials} "
+        f"trials{failures}"
+    )
+
+
+def _clean_failures_text(control: ControlGroup, summary: AttackSummary) -> str:
+    """Return how the trials of the clean scene failed, and whether they count."""
     outcome_text = words.format_outcomes(control.outcomes, summary.task)
     outcomes = f" ({outcome_text})" if outcome_text else ""
     not_a_number = ""
@@ -175,10 +209,7 @@ def _clean_remark(summary: AttackSummary) -> str:
         not_a_number = f"; in {control.not_a_number} the output is not a number"
     # If conditions vary, only trials with a right clean scene count.
     not_counted = " They do not count." if summary.over else ""
-    return (
-        f"The clean scene itself fails {n_failures} of its {control.trials} "
-        f"trials{outcomes}{not_a_number}.{not_counted}"
-    )
+    return f"{outcomes}{not_a_number}.{not_counted}"
 
 
 def _baseline_remark(summary: AttackSummary) -> str:
@@ -189,14 +220,19 @@ def _baseline_remark(summary: AttackSummary) -> str:
     # is about that one, and `policy_verified` about the policy's. Else it is None.
     policy_rate = summary.policy_verified
     if summary.adversarial_from == "random" and policy_rate:
-        return (
-            "The random search found a worse configuration than the policy did "
-            f"({policy_rate.successes} of {policy_rate.trials} with a margin of "
-            f"{policy_rate.margin:.2f}), and this is the adversarial scene. The margin "
-            f"is {words.get_margin_meaning(summary.task)}."
-        )
+        return _outdone_remark(policy_rate, summary.task)
     if verified is None or random_rate is None:
         return ""
+    return _compare_with_random(verified, random_rate)
+
+
+def _compare_with_random(verified: VerifiedRate, random_rate: VerifiedRate) -> str:
+    """Return that the random search did better or as well; empty if it did not.
+
+    Args:
+        verified: rate of the policy's result.
+        random_rate: rate of the result of the random search.
+    """
     if random_rate.rate <= 0 or random_rate.rate < verified.rate:
         return ""  # without any success, the random search did not do well
     successes = f"{random_rate.successes} of {random_rate.trials}"
@@ -204,6 +240,16 @@ def _baseline_remark(summary: AttackSummary) -> str:
     if random_rate.rate > verified.rate:
         return f"{text} better: {successes}."
     return f"{text} as well: {successes}. The policy adds nothing here."
+
+
+def _outdone_remark(policy_rate: VerifiedRate, task: str) -> str:
+    """Return that the random search found a worse configuration than the policy."""
+    return (
+        "The random search found a worse configuration than the policy did "
+        f"({policy_rate.successes} of {policy_rate.trials} with a margin of "
+        f"{policy_rate.margin:.2f}), and this is the adversarial scene. The margin "
+        f"is {words.get_margin_meaning(task)}."
+    )
 
 
 def format_success_word(summary: AttackSummary) -> str:
@@ -376,17 +422,31 @@ def _error_clause(
     if summary.minimises:
         return _begin_upper(claim)
     if summary.task == words.COMMAND:
-        if only_label is not None and not summary.target:
-            # of "action outside its envelope (steering above it)", the end
-            direction = only_label.replace("action outside its envelope ", "")
-            claim = f"{claim} {direction}" if direction else claim
-        return _begin_upper(claim)
+        direction = _deviation_text(summary, only_label)
+        return _begin_upper(f"{claim}{direction}")
     if only_label is not None:
         outcome = words.get_only_outcome(verified.outcomes)
         predicts = words.format_mistake(summary.task, thing, only_label, outcome)
         return f"The model {predicts}"
     if labels:
         return _mixed_error_clause(summary, verified, thing)
+    return _unlabeled_error_clause(summary, thing)
+
+
+def _deviation_text(summary: AttackSummary, only_label: str | None) -> str:
+    """Return in which direction a commanded action deviates, after a space.
+
+    Empty if the trials differ in it, or if the attack has a target.
+    """
+    if only_label is None or summary.target:
+        return ""
+    # of "action outside its envelope (steering above it)", the end
+    direction = only_label.replace("action outside its envelope ", "")
+    return f" {direction}" if direction else ""
+
+
+def _unlabeled_error_clause(summary: AttackSummary, thing: str) -> str:
+    """Return what the model gets wrong if the labels of the trials are not known."""
     if summary.task != words.CLASSIFICATION:
         return f"The model is wrong about {thing}"
     error = f"The model takes {thing} for something else"
@@ -441,45 +501,47 @@ def _clauses(summary: AttackSummary, thing: str) -> tuple[str, str]:
         summary: summary of the attack.
         thing: the object that is evaluated, as "this mug".
     """
-    target = summary.target or []
-    target_names = " or ".join(target)
     if summary.minimises:
         return (
             f"the model recognises {thing}, more surely than in the clean scene,",
             f"makes {thing} easier to recognise",
         )
     if summary.task == words.COMMAND:
-        if target:
-            envelope = f"the envelope of {target_names}"
-            return (
-                f"the commanded action reached {envelope}",
-                f"makes the commanded action reach {envelope}",
-            )
-        return (
-            "the commanded action left its envelope",
-            "makes the commanded action leave its envelope",
-        )
-    if target:
-        targets = " or ".join(map(words.add_article, target))
-        claim = f"predicts {target_names}"
-        if summary.task == words.CLASSIFICATION:
-            claim = f"calls {thing} {targets}"
-        return f"the model {claim}", f"makes the model call {thing} {targets}"
+        return _command_clauses(summary)
+    if summary.target:
+        return _target_clauses(summary, thing)
     claim = f"the model is wrong about {thing}"
     if summary.ending in _REASONS:
         claim = "it is wrong"
     return claim, words.format_goal(summary.objective, thing)
 
 
+def _command_clauses(summary: AttackSummary) -> tuple[str, str]:
+    """Return both clauses for a commanded action; see `_clauses`."""
+    if summary.target:
+        envelope = f"the envelope of {' or '.join(summary.target)}"
+        return (
+            f"the commanded action reached {envelope}",
+            f"makes the commanded action reach {envelope}",
+        )
+    return (
+        "the commanded action left its envelope",
+        "makes the commanded action leave its envelope",
+    )
+
+
+def _target_clauses(summary: AttackSummary, thing: str) -> tuple[str, str]:
+    """Return both clauses for an attack with a target; see `_clauses`."""
+    target = summary.target or []
+    targets = " or ".join(map(words.add_article, target))
+    claim = f"predicts {' or '.join(target)}"
+    if summary.task == words.CLASSIFICATION:
+        claim = f"calls {thing} {targets}"
+    return f"the model {claim}", f"makes the model call {thing} {targets}"
+
+
 def method_texts(summary: AttackSummary) -> dict[str, str]:
     """Return texts about the method of an attack, by name, without empty ones."""
-    segments = summary.light_path_segments
-    # values of the scene outside of a control's range, and those that replaced them
-    moved_texts = [
-        f"{value.parameter} from {format_number(value.scene)} to "
-        f"{format_number(value.used)} {value.unit}".rstrip()
-        for value in summary.clean.moved
-    ]
     facts = {
         "The search's claim": _claim_text(summary),
         "Sample count": _sample_count_text(summary),
@@ -487,15 +549,30 @@ def method_texts(summary: AttackSummary) -> dict[str, str]:
         "Gradients": _gradients_text(summary),
         "Clipped or undone": _rejected_text(summary),
         "Not finite": _non_finite_text(summary),
-        "Light paths": (
-            f"at most {segments.search} segments in the search, "
-            f"{segments.verification} in the verification"
-        ),
+        "Light paths": _light_paths_text(summary.light_path_segments),
         "Printability": _printability_text(summary),
         "Cost of printability": print_cost_text(summary),
-        "Changed before the search": ", ".join(moved_texts),
+        "Changed before the search": _moved_text(summary.clean.moved),
     }
     return {name: text for name, text in facts.items() if text}
+
+
+def _light_paths_text(segments: PathSegments) -> str:
+    """Return how many segments the light paths of the renders have at most."""
+    return (
+        f"at most {segments.search} segments in the search, "
+        f"{segments.verification} in the verification"
+    )
+
+
+def _moved_text(moved: Sequence[MovedValue]) -> str:
+    """Return the values of the scene outside of a range, and what replaced them."""
+    texts = [
+        f"{value.parameter} from {format_number(value.scene)} to "
+        f"{format_number(value.used)} {value.unit}".rstrip()
+        for value in moved
+    ]
+    return ", ".join(texts)
 
 
 def _claim_text(summary: AttackSummary) -> str:
@@ -578,17 +655,19 @@ def _printability_text(summary: AttackSummary) -> str:
     printability = summary.printability
     if printability is None:
         return ""
-    texts = [
+    texts = [_print_terms_text("clean", printability.clean)]
+    if printability.adversarial is None:
+        return texts[0]
+    texts.append(_print_terms_text("adversarial", printability.adversarial))
+    return "; ".join(texts) + " (sRGB)"
+
+
+def _print_terms_text(name: str, terms: PrintTerms) -> str:
+    """Return the print terms of a scene, with its name."""
+    return (
         f"{name}: step between neighbours {terms.variation:.3g}, distance from "
         f"printable colours {terms.off_print:.3g}"
-        for name, terms in (
-            ("clean", printability.clean),
-            ("adversarial", printability.adversarial),
-        )
-        if terms is not None
-    ]
-    unit = " (sRGB)" if printability.adversarial else ""
-    return "; ".join(texts) + unit
+    )
 
 
 def _short(value: float) -> str:
@@ -608,28 +687,42 @@ def transport_text(summary: AttackSummary) -> str:
     if not transport.used:
         text = "every picture was rendered"
         return f"{text}: {transport.reason}" if transport.reason else text
+    method = _prediction_method_text(summary, transport.method)
+    return "; ".join([method, *_list_prediction_details(transport)])
+
+
+def _list_prediction_details(transport: LinearTransport) -> list[str]:
+    """Return what is known of predicted images: error, renewals, seconds, a reason."""
+    details = []
+    if transport.error is not None:
+        details.append(_prediction_error_text(transport.error))
+    if transport.renewed:
+        details.append(f"made again {format_count(transport.renewed, 'time')}")
+    if transport.seconds is not None:
+        seconds = words.format_seconds(transport.seconds)
+        details.append(f"it and the comparisons took {seconds}")
+    if transport.reason:
+        details.append(transport.reason)
+    return details
+
+
+def _prediction_method_text(summary: AttackSummary, method: str | None) -> str:
+    """Return by what method images were predicted, and how many."""
     # "products" is the key of predicted images
     n_predicted = format_count(summary.renders.get("products"), "picture")
-    if transport.method == "crop":
-        parts = ["only the part of each picture was rendered that can change"]
-    elif transport.method == "surface light":
-        parts = [f"light on surfaces predicted {n_predicted}"]
-    else:
-        parts = [f"a matrix predicted {n_predicted}"]
-    if transport.error is not None:
-        levels = _short(transport.error.levels)
-        bias = _short(transport.error.margin_bias)
-        parts.append(
-            f"at the last comparison with a rendered picture its error was {levels} of "
-            f"255 levels of the picture's change (root mean square) and {bias} of the "
-            "objective"
-        )
-    if transport.renewed:
-        parts.append(f"made again {format_count(transport.renewed, 'time')}")
-    if transport.seconds is not None:
-        parts.append(
-            f"it and the comparisons took {words.format_seconds(transport.seconds)}"
-        )
-    if transport.reason:
-        parts.append(transport.reason)
-    return "; ".join(parts)
+    if method == "crop":
+        return "only the part of each picture was rendered that can change"
+    if method == "surface light":
+        return f"light on surfaces predicted {n_predicted}"
+    return f"a matrix predicted {n_predicted}"
+
+
+def _prediction_error_text(error: PredictionError) -> str:
+    """Return the error of predicted images at the last comparison."""
+    levels = _short(error.levels)
+    bias = _short(error.margin_bias)
+    return (
+        f"at the last comparison with a rendered picture its error was {levels} of "
+        f"255 levels of the picture's change (root mean square) and {bias} of the "
+        "objective"
+    )

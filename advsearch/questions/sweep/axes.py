@@ -13,7 +13,7 @@ drive share one draw; and so do the samples of a grid point if nothing is sample
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -108,19 +108,41 @@ def parse_axes(
     axes: dict[str, Axis] = {}
     for name, values in grid.items():
         axis = _parse_axis(name, values, instances)
-        if axis.name in axes:
-            raise InputError(
-                f"`grid` {name}: {axis.name} is given twice; leave one of the two out"
-            )
-        sampled = instances.get(axis.control_name)
-        if sampled is not None and axis.parameter.name in sampled.specs:
-            raise InputError(
-                f"`grid` {name}: `controls` {axis.control_name} sets {axis.parameter.name} "
-                "too; leave it out of one "
-                "of the two"
-            )
+        _check_not_repeated(name, axis, axes)
+        _check_not_sampled(name, axis, instances)
         axes[axis.name] = axis
     return tuple(axes.values())
+
+
+def _check_not_repeated(name: str, axis: Axis, axes: Mapping[str, Axis]) -> None:
+    """Raise an error if an earlier axis varies the same parameter.
+
+    Args:
+        name: name of the axis, as the user wrote it.
+        axis: the axis.
+        axes: the earlier axes by their stored name.
+    """
+    if axis.name in axes:
+        raise InputError(
+            f"`grid` {name}: {axis.name} is given twice; leave one of the two out"
+        )
+
+
+def _check_not_sampled(name: str, axis: Axis, instances: Mapping[str, Control]) -> None:
+    """Raise an error if a sampled control sets the parameter of an axis, too.
+
+    Args:
+        name: name of the axis, as the user wrote it.
+        axis: the axis.
+        instances: the sampled controls by name.
+    """
+    sampled = instances.get(axis.control_name)
+    if sampled is not None and axis.parameter.name in sampled.specs:
+        raise InputError(
+            f"`grid` {name}: `controls` {axis.control_name} sets {axis.parameter.name} "
+            "too; leave it out of one "
+            "of the two"
+        )
 
 
 def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axis:
@@ -136,11 +158,7 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
         InputError, UnknownNameError: the name or the values cannot be used.
     """
     where = f"`grid` {name}"
-    # Names such as "model" are settings and no controls.
-    if name in _LISTED_SETTINGS:
-        raise InputError(
-            f"{where}: several of them are given as a list: {_LISTED_SETTINGS[name]}"
-        )
+    _check_no_listed_setting(where, name)
     kind, parameter_name, colon_instance = _split_axis_name(name)
     instance = name.partition(".")[0]  # if the name is INSTANCE.PARAMETER
     if instance not in instances:
@@ -151,6 +169,53 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
         return _parse_key_axis(name, values, control)
 
     parameters = _find_parameters(values, instances, control, parameter_name, instance)
+    parameter = _select_parameter(
+        where, parameters, parameter_name, colon_instance, control.kind
+    )
+    _check_scalar(where, control, parameter, instance)
+    return Axis(
+        control_kind=control.kind,
+        control_name=instance,
+        parameter=parameter,
+        values=parse_axis_values(where, parameter, values),
+    )
+
+
+def _check_no_listed_setting(where: str, name: str) -> None:
+    """Raise an error if an axis has the name of a setting that takes several values.
+
+    Such a setting, "model" say, is no control.
+
+    Args:
+        where: the axis, as messages name it.
+        name: name of the axis.
+    """
+    if name in _LISTED_SETTINGS:
+        raise InputError(
+            f"{where}: several of them are given as a list: {_LISTED_SETTINGS[name]}"
+        )
+
+
+def _select_parameter(
+    where: str,
+    parameters: Mapping[str, Any],
+    parameter_name: str,
+    colon_instance: str | None,
+    kind: str,
+) -> Any:
+    """Return the parameter that the name of an axis states.
+
+    Args:
+        where: the axis, as messages name it.
+        parameters: the parameters of the control by name.
+        parameter_name: the parameter in the name; empty without one.
+        colon_instance: the instance after a colon in the name; None without one.
+        kind: kind of the control.
+
+    Raises:
+        InputError, UnknownNameError: there is no such parameter, or no instance after
+            the colon.
+    """
     if not parameter_name:
         raise InputError(
             f"{where}: expected CONTROL.PARAMETER, got no parameter; "
@@ -159,20 +224,10 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
     if colon_instance is not None:
         families.check_instance_name(where, colon_instance)  # raises if it is empty
     if parameter_name not in parameters:
-        raise UnknownNameError(
-            f"parameter of control {control.kind}",
-            parameter_name,
-            list(parameters),
-            f"In {where}.",
-        )
-    parameter = parameters[parameter_name]
-    _check_scalar(where, control, parameter, instance)
-    return Axis(
-        control_kind=control.kind,
-        control_name=instance,
-        parameter=parameter,
-        values=parse_axis_values(where, parameter, values),
-    )
+        what = f"parameter of control {kind}"
+        hint = f"In {where}."
+        raise UnknownNameError(what, parameter_name, list(parameters), hint)
+    return parameters[parameter_name]
 
 
 def _split_axis_name(name: str) -> tuple[str, str, str | None]:
@@ -305,31 +360,45 @@ def parse_axis_values(
         InputError: they are no values of the parameter, or not different.
     """
     is_angle = parameter.periodic and parameter.unit == "degrees"
-    # The name of an option may itself have a colon, so that it is no range.
-    can_be_range = not parameter.options
-    values: Sequence[Any]
-    if isinstance(raw_values, str) and ":" in raw_values and can_be_range:
-        values = _parse_range(where, raw_values, is_angle)
-    elif isinstance(raw_values, (list, tuple)):
-        values = raw_values
-    else:
-        values = [raw_values]
-    if not values:
-        raise InputError(
-            f"{where}: expected at least one value, got none; write "
-            "FIRST:LAST:COUNT or a list"
-        )
+    values = _list_raw_values(where, parameter, raw_values, is_angle)
+    _check_any_values(where, values)
     _check_count(where, len(values))
     # NumPy's scalars (they have `item`) become Python's.
     choices = [value.item() if hasattr(value, "item") else value for value in values]
     spec = parse_spec(where, parameter, {"choices": choices})
     assert isinstance(spec, OneOf)  # it is what choices are parsed to
     _check_distinct(where, spec.values, is_angle)
-    has_names = any(isinstance(value, str) for value in spec.values)
-    has_numbers = not parameter.options and not has_names
-    if has_numbers:
-        _check_single_precision(where, spec.values)
+    _check_number_precision(where, parameter, spec.values)
     return spec.values
+
+
+def _check_any_values(where: str, values: Sequence[Any]) -> None:
+    """Raise an error if an axis, `where` in the message, has no values."""
+    if not values:
+        raise InputError(
+            f"{where}: expected at least one value, got none; write "
+            "FIRST:LAST:COUNT or a list"
+        )
+
+
+def _list_raw_values(
+    where: str, parameter: Parameter, raw_values: Any, is_angle: bool
+) -> Sequence[Any]:
+    """Return the values of an axis as a list, a range as its values.
+
+    Args:
+        where: how messages name the axis.
+        parameter: the parameter that varies.
+        raw_values: a string, a value, or a list.
+        is_angle: whether the values are angles in degrees.
+    """
+    # The name of an option may itself have a colon, so that it is no range.
+    can_be_range = not parameter.options
+    if isinstance(raw_values, str) and ":" in raw_values and can_be_range:
+        return _parse_range(where, raw_values, is_angle)
+    if isinstance(raw_values, (list, tuple)):
+        return raw_values
+    return [raw_values]
 
 
 def _check_distinct(
@@ -347,28 +416,45 @@ def _check_distinct(
     """
     value_of_key: dict[ParameterValue, ParameterValue] = {}
     for value in values:
-        key = value
-        if is_angle and not isinstance(value, str):
-            # 9 decimals: angles that differ by float64 rounding alone are the same.
-            # Rounding may give 360, which is the angle 0: so the second `%`.
-            key = round(value % FULL_TURN, 9) % FULL_TURN
+        key = _to_angle_key(value) if is_angle else value
         if key not in value_of_key:
             value_of_key[key] = value
             continue
-        earlier = value_of_key[key]
-        if earlier == value:
-            repeated = f"{_format_value(value)} twice"
-        else:
-            repeated = (
-                f"{_format_value(earlier)} and {_format_value(value)}, the same angle"
-            )
+        repeated = _describe_repetition(value_of_key[key], value)
         raise InputError(
             f"{where}: expected different values, got {repeated}; leave one of them out"
         )
 
 
-def _check_single_precision(where: str, values: Sequence[Any]) -> None:
-    """Check that the values differ in single precision, which scenes have."""
+def _to_angle_key(value: ParameterValue) -> ParameterValue:
+    """Return an angle in degrees, in [0, 360) and rounded; names as they are."""
+    if isinstance(value, str):
+        return value
+    # 9 decimals: angles that differ by float64 rounding alone are the same. Rounding may
+    # give 360, which is the angle 0: so the second `%`.
+    return round(value % FULL_TURN, 9) % FULL_TURN
+
+
+def _describe_repetition(earlier: ParameterValue, value: ParameterValue) -> str:
+    """Return what comes twice: a value, or an angle in two forms."""
+    if earlier == value:
+        return f"{_format_value(value)} twice"
+    return f"{_format_value(earlier)} and {_format_value(value)}, the same angle"
+
+
+def _check_number_precision(
+    where: str, parameter: Parameter, values: Sequence[Any]
+) -> None:
+    """Check that numbers differ in single precision, which scenes have.
+
+    Args:
+        where: the axis, as messages name it.
+        parameter: the parameter that varies.
+        values: values of the axis; names are not checked.
+    """
+    has_names = any(isinstance(value, str) for value in values)
+    if parameter.options or has_names:
+        return
     singles = sorted(np.float32(value) for value in values)
     if any(lower == upper for lower, upper in pairwise(singles)):
         raise InputError(
@@ -394,6 +480,33 @@ def _parse_range(where: str, text: str, is_angle: bool) -> list[float]:
     Raises:
         InputError: the text is no such range.
     """
+    numbers = _parse_range_numbers(where, text)
+    if numbers.n_values < 1:
+        raise InputError(
+            f"{where}: expected a COUNT of at least 1, got {numbers.n_values} in {text!r}"
+        )
+    _check_count(where, numbers.n_values)
+    _check_bounds(where, text, numbers, is_angle=is_angle)
+    first, last, count = numbers
+    is_full_turn = is_angle and last - first == FULL_TURN
+    values = np.linspace(first, last, count, endpoint=not is_full_turn)
+    return [float(value) for value in values]
+
+
+class _RangeNumbers(NamedTuple):
+    """The numbers of a range ``FIRST:LAST:COUNT``."""
+
+    first: float
+    last: float
+    n_values: int
+
+
+def _parse_range_numbers(where: str, text: str) -> _RangeNumbers:
+    """Read the numbers of a range ``FIRST:LAST:COUNT``.
+
+    Raises:
+        InputError: the text is no such range, or FIRST or LAST is infinite.
+    """
     expected = (
         f"{where}: expected FIRST:LAST:COUNT such as 0:360:24, or values "
         f"separated by commas, got {text!r}"
@@ -411,33 +524,24 @@ def _parse_range(where: str, text: str, is_angle: bool) -> list[float]:
         ) from None
     if not (math.isfinite(first) and math.isfinite(last)):
         raise InputError(f"{expected}; FIRST and LAST have to be finite")
-    if count < 1:
-        raise InputError(
-            f"{where}: expected a COUNT of at least 1, got {count} in {text!r}"
-        )
-    _check_count(where, count)
-    _check_bounds(where, text, first, last, count, is_angle=is_angle)
-    is_full_turn = is_angle and last - first == FULL_TURN
-    values = np.linspace(first, last, count, endpoint=not is_full_turn)
-    return [float(value) for value in values]
+    return _RangeNumbers(first, last, count)
 
 
 def _check_bounds(
-    where: str, text: str, first: float, last: float, count: int, *, is_angle: bool
+    where: str, text: str, numbers: _RangeNumbers, *, is_angle: bool
 ) -> None:
     """Check that a range FIRST:LAST:COUNT has different values in ascending order.
 
     Args:
         where: name of the axis in messages.
         text: the range as the user wrote it.
-        first: first value.
-        last: last value.
-        count: count of values.
+        numbers: its numbers.
         is_angle: whether the values are angles, which repeat after a full turn.
 
     Raises:
         InputError: it has not; the message has the range to write instead.
     """
+    first, last, count = numbers
     if last < first:
         raise InputError(
             f"{where}: the range {text!r} is reversed; write {last:g}:{first:g}:{count}"
@@ -480,21 +584,35 @@ def add_grid_axes(
         scene: the scene, which decides the default ranges of a control.
     """
     control_by_name = {control.name: control for control in controls}
-    # Axes of one control have the same `instance`, the name of that control.
+    # Axes of one control have the same `control_name`.
     for instance in dict.fromkeys(axis.control_name for axis in axes):
         instance_axes = [axis for axis in axes if axis.control_name == instance]
         sampled = control_by_name.get(instance)
-        if sampled is None:
-            # Any: the type of `CONTROLS` does not have the arguments of its classes.
-            control_type: Any = CONTROLS[instance_axes[0].control_kind]
-            settings = dict[str, object]()
-        else:
-            control_type = type(sampled)
-            settings = _sampled_settings(sampled, scene)
-        for axis in instance_axes:
-            settings[axis.parameter.name] = {"choices": list(axis.values)}
-        control_by_name[instance] = control_type(name=instance, **settings)
+        control_by_name[instance] = _make_grid_control(sampled, instance_axes, scene)
     return tuple(control_by_name.values())
+
+
+def _make_grid_control(
+    sampled: Control | None, axes: Sequence[Axis], scene: SceneDescription
+) -> Control:
+    """Return a control whose parameters on axes are choices among their values.
+
+    Args:
+        sampled: the control, if it is sampled; None if it is only in the grid.
+        axes: its axes, at least one.
+        scene: the scene, which decides its default ranges.
+    """
+    if sampled is None:
+        # Any: the type of `CONTROLS` does not have the arguments of its classes.
+        control_type: Any = CONTROLS[axes[0].control_kind]
+        settings = dict[str, object]()
+    else:
+        control_type = type(sampled)
+        settings = _sampled_settings(sampled, scene)
+    for axis in axes:
+        settings[axis.parameter.name] = {"choices": list(axis.values)}
+    control: Control = control_type(name=axes[0].control_name, **settings)
+    return control
 
 
 def _sampled_settings(control: Control, scene: SceneDescription) -> dict[str, object]:
@@ -506,13 +624,26 @@ def _sampled_settings(control: Control, scene: SceneDescription) -> dict[str, ob
     stated here, so that these still vary.
     """
     # Kind and name are no parameters: the class and the instance state them.
-    settings = {
+    settings: dict[str, object] = {
         name: value
         for name, value in control.to_settings().items()
         if name not in ("kind", "name")
     }
     if control.has_requested_range:
         return settings  # the user stated its ranges: no default ones
+    return settings | _state_default_ranges(control, scene)
+
+
+def _state_default_ranges(
+    control: Control, scene: SceneDescription
+) -> dict[str, object]:
+    """Return the default ranges of a control as settings, without stated parameters.
+
+    Args:
+        control: the control.
+        scene: the scene, which decides the ranges.
+    """
+    settings = dict[str, object]()
     resolve_in_scene = control.with_scene(scene).resolve_parameter
     for parameter in map(resolve_in_scene, control.parameters):
         is_stated = parameter.name in control.specs
@@ -674,13 +805,22 @@ class SceneConfigurations:
         self._lower = domain.lower_bounds.numpy()
         self._upper = domain.upper_bounds.numpy()
         self._axes = {axis.name: (index, axis) for index, axis in enumerate(axes)}
-        # A block is the coordinates of one parameter. Small blocks share the sequence
-        # of the sampler. Large ones have random draws, since Sobol sequences are for
-        # few dimensions.
-        self._grid_coordinates: list[_GridCoordinate] = []
-        self._small_blocks: list[_SampledBlock] = []
-        self._large_blocks: list[_SampledBlock] = []
-        self._assign_blocks(domain)  # fills the three lists
+        self._assign_blocks(domain)
+        self._prepare_draws(sampler, seed)
+        self.independent_units = self._make_units(
+            axes,
+            images_until_repeat=repeat_after_scenes * self.n_images,
+            n_photographs=n_photographs,
+        )
+        self._description_cache: dict[tuple[object, ...], Mapping[str, Value]] = {}
+
+    def _prepare_draws(self, sampler: str, seed: int) -> None:
+        """Set what is sampled, and the sequences of the draws.
+
+        Args:
+            sampler: how the draws of small blocks are made, "sobol" or "random".
+            seed: seed of the draws.
+        """
         self.sampled_numbers = tuple(self._list_sampled_numbers())
         n_small = _count_columns(self._small_blocks)
         n_large = _count_columns(self._large_blocks)
@@ -688,12 +828,6 @@ class SceneConfigurations:
         self._large_draws = SampleSequence(n_large, "random", seed, "large draws")
         self.is_sampled = n_small + n_large > 0
         self.sampled_layout = (n_small, self._list_sampled_layout())
-
-        self.independent_units = self._make_units(
-            axes,
-            images_until_repeat=repeat_after_scenes * self.n_images,
-            n_photographs=n_photographs,
-        )
         # Column of each sampled number among the draws, and number of equal bins of
         # [0, 1]: a part of its range has one bin, an option with a weight several.
         self._columns = [number.draw_column for number in self.sampled_numbers]
@@ -702,7 +836,6 @@ class SceneConfigurations:
             for number in self.sampled_numbers
         ]
         self._n_bins = np.array(n_bins, dtype=np.int64)
-        self._description_cache: dict[tuple[object, ...], Mapping[str, Value]] = {}
 
     def _list_sampled_layout(self) -> tuple[tuple[str, int, int], ...]:
         """Return name, column and number of parts of each sampled number.
@@ -729,14 +862,12 @@ class SceneConfigurations:
         # If nothing is sampled, the images of a grid point differ only in noise.
         n_draws = self.samples_per_grid_point if self.is_sampled else 1
         images_per_draw = self.samples_per_grid_point // n_draws
-        time_axis = next(
-            (index for index, axis in enumerate(axes) if axis.is_time), None
-        )
+        time_axes = [index for index, axis in enumerate(axes) if axis.is_time]
         # `Units` uses the number of images per scene only with photographs.
         images_per_scene = self.n_images if n_photographs > 1 else 1
         return Units(
             self.grid.sizes,
-            frames=time_axis,
+            frames=time_axes[0] if time_axes else None,
             samples=n_draws,
             again=images_until_repeat,
             noise=images_per_draw,
@@ -754,25 +885,28 @@ class SceneConfigurations:
         Args:
             domain: the blocks of all controls, with their norms and budgets.
         """
+        # A block is the coordinates of one parameter. Small blocks share the sequence
+        # of the sampler. Large ones have random draws, since Sobol sequences are for
+        # few dimensions.
+        self._grid_coordinates: list[_GridCoordinate] = []
+        self._small_blocks: list[_SampledBlock] = []
+        self._large_blocks: list[_SampledBlock] = []
+        block_slices = domain.list_block_slices()
         for group, (block, coordinates) in zip(
-            self.space.groups, domain.list_block_slices(), strict=True
+            self.space.groups, block_slices, strict=True
         ):
             if group.name in self._axes:
                 axis_index, _ = self._axes[group.name]
-                self._grid_coordinates.append(
-                    _GridCoordinate(coordinates.start, axis_index)
-                )
+                grid_coordinate = _GridCoordinate(coordinates.start, axis_index)
+                self._grid_coordinates.append(grid_coordinate)
                 continue
             is_small = block.size <= MAX_SOBOL_SIZE
             blocks = self._small_blocks if is_small else self._large_blocks
-            first_column = _count_columns(blocks)  # the first that is free
-            n_columns = block.size + 1 if block.norm == "l2" else block.size
-            columns = slice(first_column, first_column + n_columns)
-            blocks.append(
-                _SampledBlock(
-                    group.control, group.parameter, block, coordinates, columns
-                )
+            columns = _find_free_columns(blocks, block)
+            sampled = _SampledBlock(
+                group.control, group.parameter, block, coordinates, columns
             )
+            blocks.append(sampled)
 
     def _list_sampled_numbers(self) -> Iterator[SampledNumber]:
         """Yield the sampled numbers that tables count by.
@@ -811,24 +945,12 @@ class SceneConfigurations:
         parameter, spec = _find_spec(control, name)
         full_name = f"{control.name}.{name}"
         if isinstance(spec, OneOf):
-            options = tuple(dict.fromkeys(spec.values))
-            # An option with a weight is in `spec.values` several times.
-            has_weights = options != spec.values
-            part_of_bin: tuple[int, ...] = ()
-            if has_weights:
-                part_of_bin = tuple(map(options.index, spec.values))
-            yield SampledNumber(
-                name=full_name,
-                unit=_stored_unit(parameter),
-                draw_column=first_column,
-                range_parts=options,
-                part_of_bin=part_of_bin,
-            )
+            unit = _stored_unit(parameter)
+            yield _make_sampled_choice(full_name, unit, spec, first_column)
             return
         is_vector = bool(parameter.shape)
-        for component, coordinate in enumerate(
-            range(coordinates.start, coordinates.stop)
-        ):
+        coordinate_indices = range(coordinates.start, coordinates.stop)
+        for component, coordinate in enumerate(coordinate_indices):
             suffix = f".{component}" if is_vector else ""
             yield SampledNumber(
                 name=full_name + suffix,
@@ -866,7 +988,7 @@ class SceneConfigurations:
             count: number of consecutive images of one scene.
 
         Returns:
-            (count, k) indices among `parts` of each of `sampled_numbers`.
+            (count, k) indices among `range_parts` of each of `sampled_numbers`.
         """
         draws = self._sample(self._small_draws, first, count)[:, self._columns]
         # [0, 1] is divided into equal bins for each number: find the bin of each draw.
@@ -915,7 +1037,7 @@ class SceneConfigurations:
 
         Args:
             first: number of the first image in the scene.
-            n_images: count of images.
+            count: number of images.
         """
         if not self._axes:
             return ()
@@ -937,26 +1059,38 @@ class SceneConfigurations:
             # The coordinate of a choice is the center of its part of [0, 1].
             u[:, column] = (indices[axis] + 0.5) / self.grid.sizes[axis]
         first_in_sweep = before + first
-        for draws, blocks in (
-            (self._small_draws, self._small_blocks),
-            (self._large_draws, self._large_blocks),
-        ):
-            if not blocks:
-                continue
-            samples = self._sample(draws, first_in_sweep, count)
-            for sampled in blocks:
-                u[:, sampled.coordinates] = self._transform(
-                    sampled, samples[:, sampled.columns]
-                )
-        return torch.from_numpy(np.clip(u.astype(np.float32), self._lower, self._upper))
+        self._fill_sampled(u, self._small_draws, self._small_blocks, first_in_sweep)
+        self._fill_sampled(u, self._large_draws, self._large_blocks, first_in_sweep)
+        bounded = np.clip(u.astype(np.float32), self._lower, self._upper)
+        return torch.from_numpy(bounded)
+
+    def _fill_sampled(
+        self,
+        u: Float64Array,
+        draws: SampleSequence,
+        blocks: Sequence[_SampledBlock],
+        first: int,
+    ) -> None:
+        """Write the coordinates of sampled blocks into configurations.
+
+        Args:
+            u: (n, d) configurations of consecutive images, which are changed.
+            draws: draws of the blocks.
+            blocks: the blocks.
+            first: number of the first image in the full sweep.
+        """
+        if not blocks:
+            return
+        samples = self._sample(draws, first, len(u))
+        for sampled in blocks:
+            uniform = samples[:, sampled.columns]
+            u[:, sampled.coordinates] = self._transform(sampled, uniform)
 
     def _transform(self, sampled: _SampledBlock, uniform: Float64Array) -> Float64Array:
         """Return coordinates inside the budget of a block from uniform numbers.
 
-        The coordinates are uniform in the box, or in the ball around the start. In a
-        ball they are a direction from k normal numbers, times a length (Muller 1959). A
-        choice of n options cuts [0, 1] into n equal parts; the coordinate of an option
-        is the center of its part.
+        The coordinates are uniform in the box, or in the ball around the start, or among
+        the options of a choice.
 
         Args:
             sampled: the block, of k coordinates.
@@ -968,24 +1102,14 @@ class SceneConfigurations:
         """
         block = sampled.block
         if block.n_options:
-            # a uniform number of exactly 1 belongs to the last option
-            option = np.minimum(
-                np.floor(uniform * block.n_options), block.n_options - 1
-            )
-            return np.asarray((option + 0.5) / block.n_options)
+            return _map_to_options(uniform, block.n_options)
         # Only a ball has an epsilon; the type checker needs the second condition.
-        if block.norm != "l2" or block.epsilon is None:
-            lower = self._lower[sampled.coordinates].astype(np.float64)
-            upper = self._upper[sampled.coordinates].astype(np.float64)
-            return np.asarray(lower + (upper - lower) * uniform)
-        # Normal numbers, by the inverse distribution; 0 and 1 would give infinities.
-        direction = ndtri(np.clip(uniform[:, :-1], 1e-12, 1.0 - 1e-12))
-        # The volume within a length r grows as r^k: r is the root of a uniform number.
-        length = block.epsilon * uniform[:, -1:] ** (1.0 / block.size)
-        # no division by 0, where all numbers are 0.5
-        norm = np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-30)
-        center = self._start[sampled.coordinates]
-        return np.asarray(center + direction * (length / norm))
+        if block.norm == "l2" and block.epsilon is not None:
+            center = self._start[sampled.coordinates]
+            return _map_to_ball(center, block.epsilon, uniform)
+        lower = self._lower[sampled.coordinates].astype(np.float64)
+        upper = self._upper[sampled.coordinates].astype(np.float64)
+        return np.asarray(lower + (upper - lower) * uniform)
 
     @property
     def environment(self) -> str | None:
@@ -1014,14 +1138,12 @@ class SceneConfigurations:
             if _is_described_by_base(control):
                 # all images at once, which is sixty times as fast
                 columns = self._describe_columns(control, control_u, indices)
-                for name, unit, values in columns:
-                    for row, value in zip(rows, values, strict=True):
-                        row[name] = {"value": value, "unit": unit}
+                _add_columns(rows, columns)
                 continue
             for image, row in enumerate(rows):
-                axis_points = self._find_axis_points(control, indices, image)
+                points = self._find_axis_points(control, indices, image)
                 row |= self._describe_control(
-                    control, u[image], control_u[image], axis_points
+                    control, u[image], control_u[image], points
                 )
         return rows
 
@@ -1064,19 +1186,33 @@ class SceneConfigurations:
         cached = self._description_cache.get(key)
         if cached is not None:
             return cached
-        if control.refines:  # it depends on other controls, and so needs all of u
-            description = dict(self.space.describe(u, (control,)))
-        else:
-            description = dict(control.describe(control_u))
+        description = self._describe_alone(control, u, control_u)
         for axis, index in axis_points:
             description[axis.name] = {"value": axis.values[index], "unit": axis.unit}
-        # A control has a group for each of its parameters.
-        are_all_on_axes = len(axis_points) == len(control.groups)
-        follows_from_axes = are_all_on_axes and not control.refines
-        has_room = len(self._description_cache) < MAX_CACHED_DESCRIPTIONS
-        if follows_from_axes and has_room:
+        if self._can_cache(control, n_axes=len(axis_points)):
             self._description_cache[key] = description
         return description
+
+    def _can_cache(self, control: Control, *, n_axes: int) -> bool:
+        """Return whether the values of a control follow from axes, and the cache has room.
+
+        Args:
+            control: the control.
+            n_axes: number of its parameters that are axes of the grid.
+        """
+        # A control has a group for each of its parameters.
+        are_all_on_axes = n_axes == len(control.groups)
+        follows_from_axes = are_all_on_axes and not control.refines
+        has_room = len(self._description_cache) < MAX_CACHED_DESCRIPTIONS
+        return follows_from_axes and has_room
+
+    def _describe_alone(
+        self, control: Control, u: Tensor, control_u: Tensor
+    ) -> dict[str, Value]:
+        """Return the values of a control; see `_describe_control` for the arguments."""
+        if control.refines:  # it depends on other controls, and so needs all of u
+            return dict(self.space.describe(u, (control,)))
+        return dict(control.describe(control_u))
 
     def _describe_columns(
         self,
@@ -1103,19 +1239,113 @@ class SceneConfigurations:
                 axis_index, axis = self._axes[name]
                 points = indices[axis_index].tolist()
                 yield name, axis.unit, [axis.values[point] for point in points]
-                continue
-            parameter, spec = _find_spec(control, group.parameter)
-            unit = _stored_unit(parameter)
-            for component, column in enumerate(columns):
-                if isinstance(spec, OneOf):  # a choice has a single coordinate
-                    yield name, unit, _select_options(spec, column)
-                    continue
-                suffix = f".{component}" if parameter.shape else ""
-                yield (
-                    name + suffix,
-                    unit,
-                    spec.interpolate(column, log=parameter.log).tolist(),
-                )
+            else:
+                yield from _describe_components(control, group.parameter, columns)
+
+
+def _describe_components(
+    control: Control, parameter_name: str, columns: Tensor
+) -> Iterator[tuple[str, str, list[Any]]]:
+    """Yield name, unit and values (n,) of each component of a sampled parameter.
+
+    Args:
+        control: the control, bound to the scene.
+        parameter_name: name of its parameter.
+        columns: (k, n) coordinates of the k components.
+    """
+    name = f"{control.name}.{parameter_name}"
+    parameter, spec = _find_spec(control, parameter_name)
+    unit = _stored_unit(parameter)
+    for component, column in enumerate(columns):
+        if isinstance(spec, OneOf):  # a choice has a single coordinate
+            yield name, unit, _select_options(spec, column)
+            continue
+        suffix = f".{component}" if parameter.shape else ""
+        values = spec.interpolate(column, log=parameter.log).tolist()
+        yield name + suffix, unit, values
+
+
+def _add_columns(
+    rows: Sequence[dict[str, Value]], columns: Iterable[tuple[str, str, list[Any]]]
+) -> None:
+    """Add columns of values to the rows.
+
+    Args:
+        rows: rows of n images, which are changed.
+        columns: name, unit and values (n,) of each column.
+    """
+    for name, unit, values in columns:
+        for row, value in zip(rows, values, strict=True):
+            row[name] = {"value": value, "unit": unit}
+
+
+def _make_sampled_choice(
+    name: str, unit: str, spec: OneOf, draw_column: int
+) -> SampledNumber:
+    """Return the sampled number that chooses among options.
+
+    Args:
+        name: name of the parameter.
+        unit: unit of the values.
+        spec: the options.
+        draw_column: its column among the draws.
+    """
+    options = tuple(dict.fromkeys(spec.values))
+    # An option with a weight is in `spec.values` several times.
+    has_weights = options != spec.values
+    part_of_bin: tuple[int, ...] = ()
+    if has_weights:
+        part_of_bin = tuple(map(options.index, spec.values))
+    return SampledNumber(
+        name=name,
+        unit=unit,
+        draw_column=draw_column,
+        range_parts=options,
+        part_of_bin=part_of_bin,
+    )
+
+
+def _map_to_options(uniform: Float64Array, n_options: int) -> Float64Array:
+    """Return the coordinates (n, 1) of options from uniform numbers (n, 1).
+
+    A choice of n options cuts [0, 1] into n equal parts; the coordinate of an option is
+    the center of its part.
+    """
+    # a uniform number of exactly 1 belongs to the last option
+    option = np.minimum(np.floor(uniform * n_options), n_options - 1)
+    return np.asarray((option + 0.5) / n_options)
+
+
+MIN_UNIFORM = 1e-12  # uniform numbers are kept this far from 0 and 1
+MIN_NORM = 1e-30  # smallest divisor of a direction
+
+
+def _map_to_ball(
+    center: Float64Array, radius: float, uniform: Float64Array
+) -> Float64Array:
+    """Return points (n, k) that are uniform in a ball, from uniform numbers.
+
+    They are a direction from k normal numbers, times a length (Muller 1959).
+
+    Args:
+        center: (k,) center of the ball.
+        radius: its radius.
+        uniform: (n, k + 1) in [0, 1], with that of the length last.
+    """
+    # Normal numbers, by the inverse distribution; 0 and 1 would give infinities.
+    direction = ndtri(np.clip(uniform[:, :-1], MIN_UNIFORM, 1.0 - MIN_UNIFORM))
+    # The volume within a length r grows as r^k: r is the root of a uniform number.
+    length = radius * uniform[:, -1:] ** (1.0 / len(center))
+    # no division by 0, where all numbers are 0.5
+    norm = np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), MIN_NORM)
+    return np.asarray(center + direction * (length / norm))
+
+
+def _find_free_columns(blocks: Sequence[_SampledBlock], block: Block) -> slice:
+    """Return the columns of the draws of a block, right after those of other blocks."""
+    first_column = _count_columns(blocks)
+    n_columns = block.size + 1 if block.norm == "l2" else block.size
+    return slice(first_column, first_column + n_columns)
 
 
 def _select_options(spec: OneOf, column: Tensor) -> list[Any]:

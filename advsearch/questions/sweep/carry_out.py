@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
-from advsearch.api.keywords import SceneKeywords, with_settings_signature
+from advsearch.api.keywords import (
+    SceneKeywords,
+    drop_unset,
+    with_settings_signature,
+)
 from advsearch.cluster import BatchFunction
 from advsearch.controls import Control
 from advsearch.controls.camera import CameraControl, adapt_length_unit
@@ -62,6 +66,7 @@ from advsearch.runs.directory import (
 from advsearch.runs.listing import is_finished
 from advsearch.runs.summary import read_configuration
 from advsearch.runs.twins import read_twins
+from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import ENVIRONMENT
 from advsearch.scene.formation import parse_aovs
 from advsearch.scene.things import ALL_THINGS
@@ -158,53 +163,144 @@ def sweep(
         run: directory to store the run in; None keeps it in memory, which then grows
             with every configuration.
     """
-    if not isinstance(grid, (Mapping, type(None))):
-        raise InputError(
-            "grid: expected a mapping from parameters to values, got "
-            f"{type(grid).__name__}"
-        )
+    _check_grid(grid)
     # Settings that the caller does not pass are taken from the attack, if there is one.
     attack_run = _find_attack_run(adversarial_of)
     defaults = _load_defaults(attack_run, scene, grid, controls)
     scenes = _make_list(defaults["object"] if scene is None else scene)
     default_model = defaults.get("model", "reference")
-    networks = _make_list(default_model if model is None else model)
-    controls = controls or defaults.get("controls", ())
-    task = _resolve_task(task, defaults)
-    loaded = _name_loaded_scenes(scenes)
-    set_options = _drop_unset(settings)
-    # The settings as `run.yaml` states them, with names in place of objects.
-    described: dict[str, object] = {
-        "model": ",".join(get_model_name(network) for network in networks),
-        "task": convert_to_setting(task) if isinstance(task, Task) else task,
-        "controls": loading.controls_to_settings(controls),
+    request = SweepRequest(
+        scenes=scenes,
+        models=_make_list(default_model if model is None else model),
+        controls=controls or defaults.get("controls", ()),
+        task=_resolve_task(task, defaults),
+        loaded_scenes=_name_loaded_scenes(scenes),
+        metrics=metrics,
+        tracker=tracker,
+    )
+    varied = {
         "grid": dict(grid or {}),
         "samples": samples,
         "adversarial_of": attack_run,
-        "metrics": judging.metrics_to_settings(metrics or {}),
     }
-    if loaded:
-        naming.check_no_scene_settings(set_options)
-    described |= _describe_scenes(scenes, loaded)
+    set_options = drop_unset(settings)
     run_setting = {"run": None if run is None else str(run)}
+    described = {**request.to_settings(set_options), **varied}
     # A later mapping overrides earlier ones: what is passed overrides the attack.
     config = SweepConfig(**{**defaults, **described, **set_options, **run_setting})
-    config = config.with_python_only_parts(
-        _find_python_only(config, networks, loaded, task, tracker, controls)
-    )
+    config = config.with_python_only_parts(request.find_python_only(config))
     _check_config(config)
     progress = as_progress(progress)
-    _check_can_use_workers(task, controls, networks, loaded, set_options)
-    return _run_config(
-        config,
-        scenes=loaded,
-        models=networks,
-        task=task if isinstance(task, Task) else config.task,
-        controls=controls,
-        metrics=metrics,
-        tracker=tracker,
-        progress=progress,
-    )
+    request.check_can_use_workers(set_options)
+    return _run_config(config, request, progress)
+
+
+def _check_grid(grid: object) -> None:
+    """Raise an error if a grid is no mapping, and not None."""
+    if not isinstance(grid, (Mapping, type(None))):
+        raise InputError(
+            "grid: expected a mapping from parameters to values, got "
+            f"{type(grid).__name__}"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SweepRequest:
+    """What the caller of `sweep` passed: names, settings, or objects of the session.
+
+    Attributes:
+        scenes: scenes as the caller passed them: `Scene`s, or names of objects.
+        models: models: names, files or objects.
+        controls: controls that are sampled.
+        task: task of all models.
+        loaded_scenes: the loaded ones of `scenes`: all of them or none.
+        metrics: functions or their names, by the name of the metric.
+        tracker: makes the tracker of a drive; None takes the default one.
+    """
+
+    scenes: Sequence[Any]
+    models: Sequence[Any]
+    controls: Controls
+    task: AnyTask
+    loaded_scenes: tuple[NamedScene, ...]
+    metrics: Mapping[str, str | Metric] | None
+    tracker: Callable[[], Step] | None
+
+    def to_settings(self, set_options: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the settings that describe what was passed, with names of objects.
+
+        Args:
+            set_options: the other settings that the caller passed.
+
+        Raises:
+            InputError: scenes are loaded, and a setting of a scene was passed.
+        """
+        task = self.task
+        described: dict[str, Any] = {
+            "model": ",".join(get_model_name(model) for model in self.models),
+            "task": convert_to_setting(task) if isinstance(task, Task) else task,
+            "controls": loading.controls_to_settings(self.controls),
+            "metrics": judging.metrics_to_settings(self.metrics or {}),
+        }
+        if self.loaded_scenes:
+            naming.check_no_scene_settings(set_options)
+        return described | _describe_scenes(self.scenes, self.loaded_scenes)
+
+    def find_python_only(self, config: SweepConfig) -> list[PythonOnly]:
+        """Return what exists only in this session, so that no command can repeat it.
+
+        That may be models, the scene, the task, metrics, the tracker and controls.
+
+        Args:
+            config: the settings.
+        """
+        metric_names = judging.list_session_only_metrics(config.metrics)
+        control_names = loading.list_session_only_controls(self.controls)
+        return [
+            *self._find_session_models(),
+            *self._find_session_scene_and_task(),
+            *(PythonOnly("metric", name) for name in metric_names),
+            *([] if self.tracker is None else [PythonOnly("tracker")]),
+            *(PythonOnly("control", name) for name in control_names),
+        ]
+
+    def _find_session_models(self) -> list[PythonOnly]:
+        """Return the models that exist only in this session."""
+        return [
+            PythonOnly("model", get_model_name(model))
+            for model in self.models
+            if naming.is_session_only(model)
+        ]
+
+    def _find_session_scene_and_task(self) -> list[PythonOnly]:
+        """Return the scene and the task, if they exist only in this session."""
+        parts = []
+        if any(scene.scene.is_session_only for scene in self.loaded_scenes):
+            parts.append(PythonOnly("scene"))
+        # A task is describable if its setting makes an equal one.
+        task = self.task
+        if isinstance(task, Task) and not is_describable_by_setting(task, make_task):
+            parts.append(PythonOnly("task", task.name))
+        return parts
+
+    def check_can_use_workers(self, set_options: Mapping[str, Any]) -> None:
+        """Raise an error if workers are requested for objects that they cannot load.
+
+        Workers are other processes. They load everything by its name, and do not have
+        the objects of this session.
+
+        Args:
+            set_options: the settings that the caller passed.
+
+        Raises:
+            InputError: such a setting is among `set_options`.
+        """
+        are_models_named = all(isinstance(model, (str, Path)) for model in self.models)
+        is_task_named = not isinstance(self.task, FunctionTask)
+        session_controls = loading.list_session_only_controls(self.controls)
+        has_session_objects = bool(self.loaded_scenes) or bool(session_controls)
+        if has_session_objects or not are_models_named or not is_task_named:
+            naming.check_no_worker_settings(set_options)
 
 
 def _resolve_task(task: AnyTask, defaults: Mapping[str, Any]) -> AnyTask:
@@ -219,41 +315,6 @@ def _resolve_task(task: AnyTask, defaults: Mapping[str, Any]) -> AnyTask:
     if task == "classification":
         task = defaults.get("task", task)
     return make_task(task) if callable(task) else task
-
-
-def _drop_unset(settings: Mapping[str, object]) -> dict[str, Any]:
-    """Return the settings that are not None."""
-    return {name: value for name, value in settings.items() if value is not None}
-
-
-def _check_can_use_workers(
-    task: AnyTask,
-    controls: Controls,
-    networks: Sequence[Any],
-    loaded_scenes: Sequence[Any],
-    set_options: Mapping[str, Any],
-) -> None:
-    """Raise an error if workers are requested for objects that they cannot load.
-
-    Workers are other processes. They load everything by its name, and do not have the
-    objects of this session.
-
-    Args:
-        task: task of the models.
-        controls: controls that are sampled.
-        networks: models as the caller passed them: names, files or objects.
-        loaded_scenes: scenes that the caller has loaded.
-        set_options: the settings that the caller passed.
-
-    Raises:
-        InputError: such a setting is among `set_options`.
-    """
-    are_models_named = all(isinstance(network, (str, Path)) for network in networks)
-    is_task_named = not isinstance(task, FunctionTask)
-    has_session_controls = bool(loading.list_session_only_controls(controls))
-    has_session_objects = bool(loaded_scenes) or has_session_controls
-    if has_session_objects or not are_models_named or not is_task_named:
-        naming.check_no_worker_settings(set_options)
 
 
 def _find_attack_run(
@@ -317,19 +378,19 @@ def _name_loaded_scenes(scenes: Sequence[Any]) -> tuple[NamedScene, ...]:
     Raises:
         InputError: some are loaded, and others are names.
     """
-    loaded = tuple(
-        NamedScene(
-            scene.description.object_name, scene.description.environment_name, scene
-        )
-        for scene in scenes
-        if isinstance(scene, Scene)
-    )
+    loaded = tuple(_name_scene(scene) for scene in scenes if isinstance(scene, Scene))
     if 0 < len(loaded) < len(scenes):
         raise InputError(
             "scene: expected scenes from load_scene or names of objects, "
             "got some of each"
         )
     return loaded
+
+
+def _name_scene(scene: Scene) -> NamedScene:
+    """Return a scene with the names of its object and its environment."""
+    description = scene.description
+    return NamedScene(description.object_name, description.environment_name, scene)
 
 
 def _describe_scenes(
@@ -341,14 +402,18 @@ def _describe_scenes(
         scenes: scenes as the caller passed them.
         loaded: the loaded ones: all of them or none.
     """
-    if not loaded:
-        # `scene` may list several names, as "mug, bowl": spaces and empty names are
-        # removed.
-        names = [
-            ",".join(split_names(scene)) if isinstance(scene, str) else str(scene)
-            for scene in scenes
-        ]
-        return {"object": ",".join(names)}
+    if loaded:
+        return _describe_loaded_scenes(loaded)
+    # `scene` may list several names, as "mug, bowl": spaces and empty names are removed.
+    names = [
+        ",".join(split_names(scene)) if isinstance(scene, str) else str(scene)
+        for scene in scenes
+    ]
+    return {"object": ",".join(names)}
+
+
+def _describe_loaded_scenes(loaded: Sequence[NamedScene]) -> dict[str, object]:
+    """Return the settings that describe scenes which the caller has loaded."""
     # The settings that are not replaced below are the same in all scenes.
     settings: dict[str, object] = dict(loading.scene_to_settings(loaded[0].scene))
     # each name once, in the order of the scenes
@@ -361,49 +426,6 @@ def _describe_scenes(
         # no setting can state several.
         settings |= {"size": None, "set": {}}
     return settings
-
-
-def _find_python_only(
-    config: SweepConfig,
-    models: Sequence[AnyModel],
-    scenes: Sequence[NamedScene],
-    task: AnyTask,
-    tracker: object,
-    controls: Controls,
-) -> list[PythonOnly]:
-    """Return what exists only in this session, so that no command can repeat it.
-
-    That may be models, the scene, the task, metrics, the tracker and controls.
-
-    Args:
-        config: the settings.
-        models: models as the caller passed them; a name or a file can be loaded again.
-        scenes: scenes that the caller has loaded.
-        task: task as the caller passed it.
-        tracker: makes the tracker of a drive; None for the default one.
-        controls: controls as the caller passed them.
-    """
-    parts = [
-        PythonOnly("model", get_model_name(model))
-        for model in models
-        if naming.is_session_only(model)
-    ]
-    if any(scene.scene.is_session_only for scene in scenes):
-        parts.append(PythonOnly("scene"))
-    # A task is describable if its setting makes an equal one.
-    if isinstance(task, Task) and not is_describable_by_setting(task, make_task):
-        parts.append(PythonOnly("task", task.name))
-    parts += [
-        PythonOnly("metric", name)
-        for name in judging.list_session_only_metrics(config.metrics)
-    ]
-    if tracker is not None:
-        parts.append(PythonOnly("tracker"))
-    parts += [
-        PythonOnly("control", name)
-        for name in loading.list_session_only_controls(controls)
-    ]
-    return parts
 
 
 def _check_config(config: SweepConfig) -> None:
@@ -431,51 +453,56 @@ def _check_config(config: SweepConfig) -> None:
 
 
 def _run_config(
-    config: SweepConfig,
-    *,
-    scenes: tuple[NamedScene, ...],
-    models: Sequence[Any],
-    task: AnyTask,
-    controls: Controls,
-    metrics: Mapping[str, str | Metric] | None,
-    tracker: Callable[[], Step] | None,
-    progress: Progress,
+    config: SweepConfig, request: SweepRequest, progress: Progress
 ) -> SweepResult:
     """Load and run a sweep, in its run directory if it has one.
 
     Args:
         config: the settings.
-        scenes: loaded scenes; empty to load the ones that the settings name.
-        models: models as the caller passed them.
-        task: task as the caller passed it, or a name.
-        controls: the controls that are sampled.
-        metrics: functions or their names, by the name of the metric.
-        tracker: makes the tracker of a drive; None takes the default one.
+        request: what the caller passed.
         progress: reports the progress.
     """
-    resumed = _find_resumable(config)
-    # The directory of a new run is created before the work starts. A sweep without
-    # `run` has no directory: `directory` is None below.
-    context: Any = nullcontext(resumed)  # of the directory, as `with` returns it
-    if config.run is not None and resumed is None:
-        check_free(config.run, overwrite=config.overwrite)
-        context = create_before_work(config)
+    run_context = _open_run_before_work(config)
     if config.twins is not None:
         read_twins(config.twins)  # a check before the work: raises if it is corrupt
-    with context as directory:
-        named_scenes = expand_photographs(config, scenes) or load_scenes(config)
-        job = _make_job(
-            config, named_scenes, naming.to_model_list(models), task, controls
-        )
-        job = replace(
-            job,
-            metrics=load_metrics(config.metrics, metrics),
-            tracker=tracker or job.tracker,
-        )
+    with run_context as directory:
+        job = _make_requested_job(config, request)
         if config.run is not None:
             return _run_in_directory(config, job, progress, directory)
         with open_executor(config, WORKER, progress) as executor:
             return Sweep(job, None, progress, executor).execute()
+
+
+def _open_run_before_work(config: SweepConfig) -> Any:
+    """Return a context with the run directory of a sweep, created if it is new.
+
+    The context has the directory of a stopped sweep that is continued, or a new one. It
+    has None if the sweep is not stored, or overwrites another run.
+    """
+    resumed = _find_resumable(config)
+    if config.run is None or resumed is not None:
+        return nullcontext(resumed)
+    check_free(config.run, overwrite=config.overwrite)
+    return create_before_work(config)
+
+
+def _make_requested_job(config: SweepConfig, request: SweepRequest) -> Job:
+    """Load what a caller passed, and what the settings name.
+
+    Args:
+        config: the settings.
+        request: what the caller passed; scenes that are not loaded are loaded.
+    """
+    loaded = expand_photographs(config, request.loaded_scenes)
+    named_scenes = loaded or load_scenes(config)
+    task = request.task if isinstance(request.task, Task) else config.task
+    models = naming.to_model_list(request.models)
+    job = _make_job(config, named_scenes, models, task, request.controls)
+    return replace(
+        job,
+        metrics=load_metrics(config.metrics, request.metrics),
+        tracker=request.tracker or job.tracker,
+    )
 
 
 def _find_resumable(config: SweepConfig) -> Path | None:
@@ -544,6 +571,32 @@ def _add_adversarial_arm(
     if config.adversarial_of is None:
         return tuple(named_scenes)
     directory = find_run(config.adversarial_of)
+    attack_config = _load_attack_config(directory)
+    fixed_controls = make_configured_controls(attack_config, attack_config.controls)
+    _check_not_varied(fixed_controls, sampled, axes, directory)
+    u = torch.from_numpy(read_configuration(directory))
+    arm = _name_adversarial_arm(directory)
+    # The attack's controls are fixed in both arms. Without an adversarial configuration
+    # they have their values in the clean scene.
+    clean = [
+        replace(scene, fixed_controls=fixed_controls, arm=CLEAN)
+        for scene in named_scenes
+    ]
+    adversarial = [
+        replace(scene, adversarial_configuration=u, arm=arm) for scene in clean
+    ]
+    return (*clean, *adversarial)
+
+
+def _load_attack_config(directory: Path) -> AttackConfig:
+    """Return the settings of an attack that has an adversarial configuration.
+
+    Args:
+        directory: the run directory of the attack.
+
+    Raises:
+        InputError: it has no adversarial configuration.
+    """
     summary = load_attack_summary(directory)
     attack_config = AttackConfig.from_yaml(directory / CONFIG)
     if summary.adversarial is None:
@@ -552,24 +605,16 @@ def _add_adversarial_arm(
             "is no adversarial configuration "
             "to sweep"
         )
-    fixed_controls = make_configured_controls(attack_config, attack_config.controls)
-    _check_not_varied(fixed_controls, sampled, axes, directory)
-    u = torch.from_numpy(read_configuration(directory))
-    # Each of the two arms has a name; that of the attack's run may be "clean", too.
+    return attack_config
+
+
+def _name_adversarial_arm(directory: Path) -> str:
+    """Return the name of the adversarial arm: that of the attack's run directory.
+
+    Each of the two arms has a name; that of the attack's run may be "clean", too.
+    """
     arm = directory.resolve().name
-    if arm == CLEAN:
-        arm = f"{arm}'s"
-    # The attack's controls are fixed in both arms. Without `u` they have their values
-    # in the clean scene.
-    clean = [
-        replace(named_scene, fixed_controls=fixed_controls, arm=CLEAN)
-        for named_scene in named_scenes
-    ]
-    adversarial = [
-        replace(named_scene, adversarial_configuration=u, arm=arm)
-        for named_scene in clean
-    ]
-    return (*clean, *adversarial)
+    return f"{arm}'s" if arm == CLEAN else arm
 
 
 def _make_list(value: Any) -> list[Any]:
@@ -660,21 +705,14 @@ def _make_job(
     Raises:
         InputError: something in the settings does not fit together.
     """
-    checked_config = config
-    if config.path is not None:
-        # These settings need a control that travels along the path. They are left out
-        # of the check, since `add_frame_axis` adds such a control if there is none.
-        no_path = {"path": None, "shutter": None, "rolling": None}
-        checked_config = config.model_copy(update=no_path)
-    naming.check_run_settings(checked_config)
+    _check_run_settings(config)
     sampled = make_configured_controls(config, controls)
     grid = config.grid
     if config.path is not None:
         sampled, grid = add_frame_axis(config, sampled)
     axes = parse_axes(grid, sampled)
-    _check_something_varies(
-        config, axes, sampled, n_combinations=len(named_scenes) * len(models)
-    )
+    n_combinations = len(named_scenes) * len(models)
+    _check_something_varies(config, axes, sampled, n_combinations)
     named_scenes = _add_adversarial_arm(config, named_scenes, sampled, axes)
     check_scenes(named_scenes, sampled, axes)
     axes = _set_camera_units(axes, named_scenes)
@@ -691,13 +729,38 @@ def _make_job(
         axes=axes,
         aovs=parse_aovs(config.aov),
     )
+    return _add_warnings(job, [*warnings, *_find_control_notes(job)])
+
+
+def _add_warnings(job: Job, warnings: Iterable[str]) -> Job:
+    """Return a job with warnings, each once: several scenes may have the same."""
+    return replace(job, warnings=tuple(dict.fromkeys(warnings)))
+
+
+def _check_run_settings(config: SweepConfig) -> None:
+    """Check the settings of a sweep that do not fit together.
+
+    Settings of a path need a control that travels along it. They are left out of the
+    check, since `add_frame_axis` adds such a control if there is none.
+
+    Raises:
+        InputError: two settings do not fit together.
+    """
+    checked_config = config
+    if config.path is not None:
+        no_path = {"path": None, "shutter": None, "rolling": None}
+        checked_config = config.model_copy(update=no_path)
+    naming.check_run_settings(checked_config)
+
+
+def _find_control_notes(job: Job) -> list[str]:
+    """Return the notes of the controls on each scene."""
+    notes = list[str]()
     # Notes do not depend on the size of images: the first model's is used.
-    for named_scene in named_scenes:
-        warnings += job.bind_controls(named_scene, job.image_sizes[0]).list_notes(
-            named_scene.scene.description
-        )
-    unique_warnings = tuple(dict.fromkeys(warnings))  # scenes may have the same notes
-    return replace(job, warnings=unique_warnings)
+    for named_scene in job.scenes:
+        space = job.bind_controls(named_scene, job.image_sizes[0])
+        notes += space.list_notes(named_scene.scene.description)
+    return notes
 
 
 def _check_something_varies(
@@ -717,17 +780,24 @@ def _check_something_varies(
     Raises:
         InputError: `samples` is set but nothing is sampled, or nothing varies at all.
     """
-    if config.samples is not None and not sampled:
-        raise InputError(
-            "samples: expected `controls` beside it, which says what is drawn by "
-            "chance; add `controls=pose`, say, or "
-            "leave `samples` out"
-        )
+    _check_samples_have_controls(config, sampled)
     if not axes and not sampled and n_combinations == 1:
         raise InputError(
             "grid: expected something that varies, got nothing; add an axis such as "
             "`grid` pose.yaw=0:360:24, or "
             "`controls=pose` `samples=100`"
+        )
+
+
+def _check_samples_have_controls(
+    config: SweepConfig, sampled: Sequence[Control]
+) -> None:
+    """Raise an error if `samples` is set but no control is sampled."""
+    if config.samples is not None and not sampled:
+        raise InputError(
+            "samples: expected `controls` beside it, which says what is drawn by "
+            "chance; add `controls=pose`, say, or "
+            "leave `samples` out"
         )
 
 
@@ -769,35 +839,71 @@ def _load_models_and_tasks(
         The models, the tasks, and remarks on both.
     """
     shared_task = make_task(task)
-    _check_distinct_names([get_model_name(model) for model in models])
-    networks, warnings = load_models(models, shared_task, config)
-    # Several files or functions may return models of the same name.
-    _check_distinct_names([network.name for network in networks])
+    networks, warnings = _load_distinct_models(models, shared_task, config)
     scenes = [named_scene.scene for named_scene in named_scenes]
     tasks = tuple(
-        judging.calibrate_task(
-            shared_task.on(network),  # a copy for this model
-            network,
-            scenes,
-            config.label,
-            config.judge,
-            config.image_settings,
-        )
+        _calibrate_for_model(config, shared_task, network, scenes)
         for network in networks
     )
     # Remarks are collected before `make_each_thing_task` wraps the tasks below: the
     # wrappers have none.
-    warnings += [
-        remark for network_task in tasks for remark in network_task.output_remarks
-    ]
+    for network_task in tasks:
+        warnings += network_task.output_remarks
     if config.judge == ALL_THINGS:
         tasks = tuple(map(make_each_thing_task, tasks))
-    labels = {
+    warnings += judging.find_label_warnings(
+        networks, config.label, _find_object_labels(named_scenes)
+    )
+    return networks, tasks, warnings
+
+
+def _find_object_labels(named_scenes: Sequence[NamedScene]) -> dict[str, str | None]:
+    """Return the label of each object by its name."""
+    return {
         named_scene.object_name: named_scene.scene.description.object.label
         for named_scene in named_scenes
     }
-    warnings += judging.find_label_warnings(networks, config.label, labels)
-    return networks, tasks, warnings
+
+
+def _load_distinct_models(
+    models: Sequence[AnyModel], task: Task, config: SweepConfig
+) -> tuple[tuple[Model, ...], list[str]]:
+    """Load models, and check that their names differ.
+
+    Args:
+        models: names, files or modules.
+        task: task of all models.
+        config: the settings.
+
+    Returns:
+        The models, and warnings of loading.
+    """
+    _check_distinct_names([get_model_name(model) for model in models])
+    networks, warnings = load_models(models, task, config)
+    # Several files or functions may return models of the same name.
+    _check_distinct_names([network.name for network in networks])
+    return networks, warnings
+
+
+def _calibrate_for_model(
+    config: SweepConfig, shared_task: Task, network: Model, scenes: Sequence[Scene]
+) -> Task:
+    """Return the task of one model, calibrated with its outputs.
+
+    Args:
+        config: the settings.
+        shared_task: task of all models.
+        network: the model.
+        scenes: all scenes of the sweep.
+    """
+    return judging.calibrate_task(
+        shared_task.on(network),  # a copy for this model
+        network,
+        scenes,
+        config.label,
+        config.judge,
+        config.image_settings,
+    )
 
 
 def _find_scene_notes(
@@ -864,18 +970,45 @@ def _load_named_scenes(config: SweepConfig) -> list[NamedScene]:
             NamedScene(name, scene.description.environment_name, scene)
             for name, scene in scenes.items()
         ]
-    first_scene = scenes[objects[0]].description
-    # Each environment is loaded once, with the first object, and used for all others.
-    environment_by_name = {first_environment: first_scene.environment}
-    for name in environments[1:]:
-        scene = load_scene(first_scene.object, name)
+    return _combine_with_environments(scenes, environments)
+
+
+def _combine_with_environments(
+    scenes: Mapping[str, Scene], environments: Sequence[str]
+) -> list[NamedScene]:
+    """Return every object in every environment, sorted by object.
+
+    Args:
+        scenes: the scene of each object in the first environment, by the object's name.
+        environments: names of the environments.
+    """
+    first_scene = next(iter(scenes.values()))
+    environment_by_name = _load_environments(first_scene, environments)
+    return [
+        NamedScene(name, environment_name, scenes[name].with_environment(environment))
+        for name in scenes
+        for environment_name, environment in environment_by_name.items()
+    ]
+
+
+def _load_environments(
+    first_scene: Scene, names: Sequence[str]
+) -> dict[str, EnvironmentAsset | None]:
+    """Load each environment once, with the first object, to use it for all others.
+
+    Args:
+        first_scene: the scene of the first object in the first environment.
+        names: names of the environments.
+
+    Returns:
+        The environments by name.
+    """
+    description = first_scene.description
+    environment_by_name = {names[0]: description.environment}
+    for name in names[1:]:
+        scene = load_scene(description.object, name)
         environment_by_name[name] = scene.description.environment
-    named_scenes = []
-    for object_name in objects:
-        for environment_name, environment in environment_by_name.items():
-            scene = scenes[object_name].with_environment(environment)
-            named_scenes.append(NamedScene(object_name, environment_name, scene))
-    return named_scenes
+    return environment_by_name
 
 
 def expand_photographs(
@@ -890,6 +1023,17 @@ def expand_photographs(
         config: the settings, which name the controls and the axes.
         scenes: the scenes, each in its first photograph.
     """
+    if _chooses_photograph(config):
+        return tuple(scenes)
+    return tuple(
+        in_photograph
+        for named_scene in scenes
+        for in_photograph in _expand_folder(named_scene)
+    )
+
+
+def _chooses_photograph(config: SweepConfig) -> bool:
+    """Return whether a control of a sweep, or an axis of its grid, chooses a photograph."""
     control_names = [
         *config.controls,
         *(axis_name.partition(".")[0] for axis_name in config.grid),
@@ -899,26 +1043,23 @@ def expand_photographs(
         getattr(config.find_control_type(name), "kind", "")
         for name in control_names
     ]
-    chooses_photograph = BACKDROP in kinds
-    if chooses_photograph:
-        return tuple(scenes)
-    expanded = list[NamedScene]()
-    for named_scene in scenes:
-        folder = named_scene.scene.description.photographs
-        if folder is None:
-            expanded.append(named_scene)
-            continue
-        for name, description in folder.scenes.items():
-            scene = replace(named_scene.scene, description=description)
-            expanded.append(
-                replace(
-                    named_scene,
-                    scene=scene,
-                    environment_name=description.environment_name,
-                    photograph_name=name,
-                )
-            )
-    return tuple(expanded)
+    return BACKDROP in kinds
+
+
+def _expand_folder(named_scene: NamedScene) -> list[NamedScene]:
+    """Return a scene in every photograph of its folder; itself without a folder."""
+    folder = named_scene.scene.description.photographs
+    if folder is None:
+        return [named_scene]
+    return [
+        replace(
+            named_scene,
+            scene=replace(named_scene.scene, description=description),
+            environment_name=description.environment_name,
+            photograph_name=name,
+        )
+        for name, description in folder.scenes.items()
+    ]
 
 
 def _check_distinct_names(names: Sequence[str]) -> None:

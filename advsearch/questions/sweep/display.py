@@ -22,12 +22,14 @@ from advsearch.errors import InputError
 from advsearch.options import Outcome
 from advsearch.questions.sweep.settings import BLIND, HARMLESS
 from advsearch.questions.sweep.summary import (
+    ArmComparison,
     AxisRow,
     DriveRates,
     OverDrives,
     PairedRates,
     SurfaceMap,
     SurfacePart,
+    SurfaceTable,
     SweepMap,
     SweepSummary,
 )
@@ -61,7 +63,7 @@ from advsearch.report.wording import (
     percent,
     shorten_name,
 )
-from advsearch.runs.results import INTERRUPTED, CountedPredictions
+from advsearch.runs.results import INTERRUPTED, CountedPredictions, VerifiedRate
 from advsearch.settings import split_names
 from advsearch.statistics.monotone import Dip, _fit_falling, find_dips
 
@@ -70,6 +72,7 @@ MAX_TICKS = 16  # number of values of an axis that have a label
 USUAL_LABEL_LENGTH = 8
 # total number of characters of the labels of an axis that fit side by side
 MAX_LABELS_LENGTH = 50
+SLANT_OF_LABELS = 45  # degrees by which long labels of an x axis are rotated
 # Sizes of figures in inches. A map has the size of its frame plus that of each cell;
 # labels longer than usual add the width or the height of each further character.
 ACCURACY_FIGURE_SIZE = (5.6, 3.6)
@@ -90,21 +93,33 @@ def figure_size(summary: SweepSummary) -> tuple[float, float] | None:
     if not summary.cells:
         return ACCURACY_FIGURE_SIZE if _list_single_axis(summary) else None
     x_axis, y_axis = summary.cells.axes
-    n_columns = min(len(x_axis.values), MAX_TICKS)
-    n_rows = min(len(y_axis.values), MAX_TICKS)
-    rotated_length = 0
-    if _are_long(x_axis.values):
-        rotated_length = _find_longest_label(x_axis.values)
-    left_length = _find_longest_label(y_axis.values)
+    extra_left, extra_below = _count_extra_characters(x_axis.values, y_axis.values)
+    cells_width = CELL_WIDTH * min(len(x_axis.values), MAX_TICKS)
+    cells_height = CELL_HEIGHT * min(len(y_axis.values), MAX_TICKS)
+    width = MAP_FRAME_WIDTH + cells_width + CHARACTER_WIDTH * extra_left
+    height = MAP_FRAME_HEIGHT + cells_height + ROTATED_CHARACTER_HEIGHT * extra_below
+    return width, height
+
+
+def _count_extra_characters(
+    x_values: Sequence[Any], y_values: Sequence[Any]
+) -> tuple[int, int]:
+    """Return how many characters the labels of a map are longer than usual.
+
+    Args:
+        x_values: values of the x axis.
+        y_values: values of the y axis.
+
+    Returns:
+        The characters for which room is needed at the left of the axes, and below them.
+    """
+    rotated_length = _find_longest_label(x_values) if _are_long(x_values) else 0
+    left_length = _find_longest_label(y_values)
     # Labels of the x axis end below their tick: rotated ones begin to the left of it,
     # so that the first of them needs room at the left of the axes.
     extra_left = max(max(left_length, rotated_length) - USUAL_LABEL_LENGTH, 0)
     extra_below = max(rotated_length - USUAL_LABEL_LENGTH, 0)
-    width = MAP_FRAME_WIDTH + CELL_WIDTH * n_columns + CHARACTER_WIDTH * extra_left
-    height = (
-        MAP_FRAME_HEIGHT + CELL_HEIGHT * n_rows + ROTATED_CHARACTER_HEIGHT * extra_below
-    )
-    return width, height
+    return extra_left, extra_below
 
 
 def _find_longest_label(values: Sequence[Any]) -> int:
@@ -157,31 +172,51 @@ def _draw_map(axes: Any, summary: SweepSummary, cells: SweepMap) -> None:
     x_axis, y_axis = cells.axes
     # Cells are 1 wide and high, and centered at whole numbers.
     extent = (-0.5, len(x_axis.values) - 0.5, -0.5, len(y_axis.values) - 0.5)
-    counts = np.array(cells.configurations, dtype=float)
     # The accuracy of a single prediction is only 0 or 1: its margin says more.
-    if counts.max() > 1:
-        measure = ACCURACY
-        no_values = np.full(counts.shape, np.nan)
-        values = np.divide(cells.correct, counts, out=no_values, where=counts > 0)
-    else:
-        measure = MARGIN
-        values = np.array(cells.margin, dtype=float)
+    counts = np.array(cells.configurations, dtype=float)
+    has_accuracy = bool(counts.max() > 1)
+    cell_values = _compute_accuracies(cells) if has_accuracy else _list_margins(cells)
     draw_heat_map(
         axes,
-        values.tolist(),
+        cell_values,
         extent,
-        measure,
+        ACCURACY if has_accuracy else MARGIN,
         format_axis_title(x_axis.axis, x_axis.unit),
         format_axis_title(y_axis.axis, y_axis.unit),
     )
-    rotation = 45 if _are_long(x_axis.values) else 0
-    axes.set_xticks(*_select_ticks(x_axis.values), rotation=rotation)
+    _label_x_values(axes, x_axis.values)
     axes.set_yticks(*_select_ticks(y_axis.values))
+    axes.set_title(_make_map_title(summary, n_more_axes=len(cells.over)))
+
+
+def _label_x_values(axes: Any, values: Sequence[Any]) -> None:
+    """Label the values of an x axis, slanted if their labels are long."""
+    indices, labels = _select_ticks(values)
+    rotation = SLANT_OF_LABELS if _are_long(values) else 0
+    axes.set_xticks(indices, labels, rotation=rotation)
+
+
+def _compute_accuracies(cells: SweepMap) -> list[list[float]]:
+    """Return the accuracy of each cell of a map; NaN without configurations."""
+    counts = np.array(cells.configurations, dtype=float)
+    no_values = np.full(counts.shape, np.nan)
+    accuracies = np.divide(cells.correct, counts, out=no_values, where=counts > 0)
+    rows: list[list[float]] = accuracies.tolist()
+    return rows
+
+
+def _list_margins(cells: SweepMap) -> list[list[float]]:
+    """Return the margin of each cell of a map; NaN if it is unknown."""
+    rows: list[list[float]] = np.array(cells.margin, dtype=float).tolist()
+    return rows
+
+
+def _make_map_title(summary: SweepSummary, n_more_axes: int) -> str:
+    """Return the title of a map; it is over more axes than the two that are drawn."""
     title = _name_objects_and_models(summary)
-    n_more_axes = len(cells.over)
     if n_more_axes:
         title += f", over {n_more_axes} more {'axes' if n_more_axes > 1 else 'axis'}"
-    axes.set_title(title)
+    return title
 
 
 def _draw_accuracy(axes: Any, summary: SweepSummary, rows: Sequence[AxisRow]) -> None:
@@ -193,24 +228,10 @@ def _draw_accuracy(axes: Any, summary: SweepSummary, rows: Sequence[AxisRow]) ->
         rows: values of the axis with their counts, at least one.
     """
     values = [row.value for row in rows]
-    # A single draw has no interval.
-    intervals = [
-        (index, *row.interval) for index, row in enumerate(rows) if row.interval
-    ]
-    if intervals:
-        x, lower, upper = zip(*intervals, strict=True)
-        axes.vlines(
-            x,
-            lower,
-            upper,
-            color=BLUE,
-            alpha=0.35,
-            linewidth=5,
-            label="95 % interval",
-        )
+    _draw_intervals(axes, rows)
     accuracy = [row.accuracy for row in rows]
     axes.plot(range(len(rows)), accuracy, "o", color=BLUE, label="accuracy")
-    axes.set_xticks(*_select_ticks(values), rotation=45 if _are_long(values) else 0)
+    _label_x_values(axes, values)
     axes.set(
         xlabel=format_axis_title(rows[0].axis, rows[0].unit),
         ylabel="accuracy",
@@ -220,6 +241,18 @@ def _draw_accuracy(axes: Any, summary: SweepSummary, rows: Sequence[AxisRow]) ->
     axes.set_title(_name_objects_and_models(summary))
     axes.grid(True, axis="y")
     axes.figure.legend(loc="outside lower center", ncols=2)
+
+
+def _draw_intervals(axes: Any, rows: Sequence[AxisRow]) -> None:
+    """Draw the interval of the accuracy at each value; a single draw has none."""
+    intervals = [
+        (index, *row.interval) for index, row in enumerate(rows) if row.interval
+    ]
+    if not intervals:
+        return
+    x, lower, upper = zip(*intervals, strict=True)
+    style = {"color": BLUE, "alpha": 0.35, "linewidth": 5}
+    axes.vlines(x, lower, upper, **style, label="95 % interval")
 
 
 def _select_ticks(values: Sequence[Any]) -> tuple[list[int], list[str]]:
@@ -302,36 +335,52 @@ SURFACE_COLUMNS: dict[str, Column] = {
 def make_sweep_view(summary: SweepSummary) -> ShownResult:
     """Return the view of a sweep: what a text, a page and a notebook show of it."""
     axes = _group_axes(summary)
-    sections = [*_make_text_sections(summary, axes)]
+    parts_for_page = _make_page_parts(summary, axes)
+    page_parts = (replace(part, only_medium="page") for part in parts_for_page)
+    sections = [
+        *_make_text_sections(summary, axes),
+        *_make_figure_parts(summary),
+        *page_parts,
+    ]
+    return ShownResult(
+        _verdict(summary),
+        sections,
+        _make_sweep_facts(summary),
+        says_interrupted=_has_ended_early(summary),
+    )
+
+
+def _make_figure_parts(summary: SweepSummary) -> Iterator[ResultPart]:
+    """Yield the figure of a sweep for a notebook, if there is anything to draw."""
     size = figure_size(summary)
     if size is not None:
-        sections.append(
-            ResultPart(
-                draw=lambda figure_axes: draw_sweep_on(summary, figure_axes),
-                size=size,
-                only_medium="notebook",
-            )
+        yield ResultPart(
+            draw=lambda figure_axes: draw_sweep_on(summary, figure_axes),
+            size=size,
+            only_medium="notebook",
         )
-    sections += (
-        replace(part, only_medium="page") for part in _make_page_parts(summary, axes)
-    )
+
+
+def _make_sweep_facts(summary: SweepSummary) -> dict[str, str]:
+    """Return the facts of a sweep; those with an empty text are left out."""
     run_images = f"{summary.run}/images"
     has_drive_file = bool(summary.drives and summary.run)
-    # Facts with an empty text are left out.
-    facts = {
+    return {
         "worst": _describe_worst_configuration(summary),
         "there": _describe_worst_prediction(summary),  # the prediction in the worst one
         "renders": str(summary.renders["sweep"]),
         "worst drive": f"{run_images}/drive.webp" if has_drive_file else "",
         "map of the surface": f"{run_images}/surface.png" if summary.surface else "",
     }
+
+
+def _has_ended_early(summary: SweepSummary) -> bool:
+    """Return whether the verdict states that a sweep was cut off."""
     # The verdict says so itself if a sweep that was cut off has counted nothing.
     if summary.configurations > 0:
-        ended_early = summary.looked_at < summary.planned
-    else:
-        # Nothing is counted: either no image shows the object, or none was evaluated.
-        ended_early = not summary.out_of_view
-    return ShownResult(_verdict(summary), sections, facts, says_interrupted=ended_early)
+        return summary.looked_at < summary.planned
+    # Nothing is counted: either no image shows the object, or none was evaluated.
+    return not summary.out_of_view
 
 
 def _group_axes(summary: SweepSummary) -> dict[str, list[AxisRow]]:
@@ -358,30 +407,43 @@ def _make_text_sections(
     if distance:
         yield ResultPart(text=[describe_detection_distance(distance)])
     for rates in summary.drives or ():
-        yield ResultPart(
-            drive_title(rates), column_heads=DRIVE_HEADS, rows=make_drive_rows(rates)
-        )
-    yield ResultPart.make_table(
-        summary.changes or [], CHANGE_COLUMNS, title=CHANGES_TITLE
-    )
-    # The axis "answer" has the clean scene and the adversarial one: `_make_arms_table`
-    # shows these.
-    if axes.keys() - {"answer"}:
-        introduction = READING
-        if summary.arms:
-            first_letter = READING[0].lower()
-            introduction = (
-                "Of the clean scene and the adversarial one together: "
-                f"{first_letter}{READING[1:]}"
-            )
-        yield ResultPart(text=[introduction])
-        for name, rows in axes.items():
-            if name != "answer":
-                yield _make_axis_table(name, rows, summary.task)
+        title = drive_title(rates)
+        rows = make_drive_rows(rates)
+        yield ResultPart(title, column_heads=DRIVE_HEADS, rows=rows)
+    yield _make_changes_table(summary)
+    yield from _make_axis_sections(summary, axes)
     if summary.surface is not None:
         sentences = "\n".join(surface_sentences(summary.surface))
         title = "What is seen of the surface when the model is wrong:"
         yield ResultPart(title, [sentences])
+
+
+def _make_changes_table(summary: SweepSummary) -> ResultPart:
+    """Return the table of predictions about changed images; empty without any."""
+    return ResultPart.make_table(
+        summary.changes or [], CHANGE_COLUMNS, title=CHANGES_TITLE
+    )
+
+
+def _make_axis_sections(
+    summary: SweepSummary, axes: Mapping[str, Sequence[AxisRow]]
+) -> Iterator[ResultPart]:
+    """Yield an introduction and a table for each axis; see `_make_text_sections`."""
+    # The axis "answer" has the clean scene and the adversarial one: `_make_arms_table`
+    # shows these.
+    if not axes.keys() - {"answer"}:
+        return
+    introduction = READING
+    if summary.arms:
+        first_letter = READING[0].lower()
+        introduction = (
+            "Of the clean scene and the adversarial one together: "
+            f"{first_letter}{READING[1:]}"
+        )
+    yield ResultPart(text=[introduction])
+    for name, rows in axes.items():
+        if name != "answer":
+            yield _make_axis_table(name, rows, summary.task)
 
 
 def _make_arms_table(adversarial_run: str, pair: PairedRates, task: str) -> ResultPart:
@@ -446,40 +508,53 @@ def _make_page_parts(
     """
     distance = find_detection_distance(summary)
     if distance:
-        sentence = describe_detection_distance(distance)
-        yield ResultPart(
-            "How far away it is seen",
-            [sentence],
-            draw=partial(draw_detection_distance, distance),
-            note=sentence,
-        )
+        yield _make_distance_part(distance)
     for index, rates in enumerate(summary.drives or ()):
-        # The title stands once, above all tables. The only images are those of the
-        # worst drive of the first model.
-        is_first = index == 0
-        yield ResultPart(
-            "Whole drives" if is_first else "",
-            [drive_title(rates)],
-            column_heads=DRIVE_HEADS,
-            rows=make_drive_rows(rates),
-            figure="images/drive.png" if is_first else "",
-        )
-    yield ResultPart.make_table(
-        summary.changes or [], CHANGE_COLUMNS, title=CHANGES_TITLE
-    )
+        yield _make_drive_part(rates, is_first=index == 0)
+    yield _make_changes_table(summary)
     if summary.surface is not None:
         yield from _make_surface_parts(summary.surface)
     for name, rows in axes.items():
         if len(rows) <= MAX_PAGE_ROWS:
-            columns = dict(AXIS_COLUMNS)
-            # Only detectors have outcomes of wrong predictions, such as "missed".
-            if any(row.outcomes for row in rows):
-                columns["the others"] = lambda row: wording.format_outcomes(
-                    row.outcomes, summary.task
-                )
-            yield ResultPart.make_table(
-                rows, columns, title=f"Accuracy by {name}", folded=True
-            )
+            yield _make_folded_axis_table(name, rows, summary.task)
+
+
+def _make_distance_part(distance: DetectionDistance) -> ResultPart:
+    """Return the chart of the detection distance, with its sentence."""
+    sentence = describe_detection_distance(distance)
+    return ResultPart(
+        "How far away it is seen",
+        [sentence],
+        draw=partial(draw_detection_distance, distance),
+        note=sentence,
+    )
+
+
+def _make_drive_part(rates: DriveRates, *, is_first: bool) -> ResultPart:
+    """Return the table of a model's rates over drives, for a page.
+
+    The title stands once, above all tables. The only images are those of the worst
+    drive of the first model.
+    """
+    return ResultPart(
+        "Whole drives" if is_first else "",
+        [drive_title(rates)],
+        column_heads=DRIVE_HEADS,
+        rows=make_drive_rows(rates),
+        figure="images/drive.png" if is_first else "",
+    )
+
+
+def _make_folded_axis_table(
+    name: str, rows: Sequence[AxisRow], task: str
+) -> ResultPart:
+    """Return a table of the accuracy by the values of an axis, folded on a page."""
+    columns = dict(AXIS_COLUMNS)
+    # Only detectors have outcomes of wrong predictions, such as "missed".
+    if any(row.outcomes for row in rows):
+        columns["the others"] = lambda row: wording.format_outcomes(row.outcomes, task)
+    title = f"Accuracy by {name}"
+    return ResultPart.make_table(rows, columns, title=title, folded=True)
 
 
 def _make_surface_parts(surface: SurfaceMap) -> Iterator[ResultPart]:
@@ -498,27 +573,36 @@ def _make_surface_parts(surface: SurfaceMap) -> Iterator[ResultPart]:
 
 def _verdict(summary: SweepSummary) -> str:
     """Return the result of a sweep in one or two sentences."""
+    if not summary.configurations and summary.out_of_view:
+        return "The object is in no picture."
     if not summary.configurations:
-        if summary.out_of_view:
-            return "The object is in no picture."
         return "Interrupted before the first configuration."
+    if summary.ending == INTERRUPTED and summary.looked_at < summary.planned:
+        return _interrupted_verdict(summary)
+    if summary.arms and summary.arms.pairs:
+        return _verdict_of_arms(summary.arms)
+    configurations = format_count(summary.configurations, "configuration")
+    rate = f"({format_accuracy(summary)}){format_grid_caution(summary)}"
+    outcomes = describe_wrong_outcomes(summary)
+    return (
+        f"The model is right in {summary.correct} of {configurations} {rate}{outcomes}."
+    )
+
+
+def _interrupted_verdict(summary: SweepSummary) -> str:
+    """Return the result so far of a sweep that was interrupted."""
     rate = format_accuracy(summary)
     outcomes = describe_wrong_outcomes(summary)
-    if summary.ending == INTERRUPTED and summary.looked_at < summary.planned:
-        return (
-            f"Interrupted after {summary.looked_at} of {summary.planned} "
-            f"configurations: right in {summary.correct} ({rate}){outcomes}."
-        )
-    if summary.arms and summary.arms.pairs:
-        return " ".join(
-            format_paired_rates(summary.arms.adversarial_run, pair)
-            for pair in summary.arms.pairs
-        )
-    configurations = format_count(summary.configurations, "configuration")
     return (
-        f"The model is right in {summary.correct} of {configurations} "
-        f"({rate}){format_grid_caution(summary)}{outcomes}."
+        f"Interrupted after {summary.looked_at} of {summary.planned} "
+        f"configurations: right in {summary.correct} ({rate}){outcomes}."
     )
+
+
+def _verdict_of_arms(arms: ArmComparison) -> str:
+    """Return how the adversarial scene compares with the clean one, for each model."""
+    rates = [format_paired_rates(arms.adversarial_run, pair) for pair in arms.pairs]
+    return " ".join(rates)
 
 
 def describe_wrong_outcomes(summary: SweepSummary) -> str:
@@ -552,9 +636,7 @@ def _make_axis_table(name: str, rows: Sequence[AxisRow], task: str) -> ResultPar
         rows: its values.
         task: name of the task.
     """
-    title = name
-    if rows[0].unit not in (*wording.PLAIN_UNITS, "name"):  # "name": a discrete choice
-        title += f", {rows[0].unit}"
+    title = _make_axis_title(name, rows[0].unit)
     listed = list(rows)
     if len(rows) > MAX_TEXT_ROWS:
         listed = _select_worst(rows, MAX_TEXT_ROWS // 2)
@@ -563,23 +645,33 @@ def _make_axis_table(name: str, rows: Sequence[AxisRow], task: str) -> ResultPar
             "least often)"
         )
     has_outcomes = any(row.outcomes for row in rows)
-    lines = []
-    for row in listed:
-        # An unknown accuracy has an empty bar, as 0 has.
-        n_filled = round((row.accuracy or 0.0) * BAR_LENGTH)
-        bar = "#" * n_filled
-        accuracy, interval = _make_accuracy_cells(row)
-        cells = [
-            wording.format_parameter_value(row.value),
-            bar.ljust(BAR_LENGTH, "."),
-            accuracy,
-            f"{row.correct} of {row.configurations}",
-            interval,
-        ]
-        if has_outcomes:
+    lines = [_make_value_row(row) for row in listed]
+    if has_outcomes:
+        for cells, row in zip(lines, listed, strict=True):
             cells.append(wording.format_outcomes(row.outcomes, task))
-        lines.append(cells)
     return ResultPart(title, rows=lines)
+
+
+def _make_axis_title(name: str, unit: str) -> str:
+    """Return the name of an axis with its unit, if values are written without it."""
+    # "name" is the unit of a discrete choice.
+    has_unit = unit not in (*wording.PLAIN_UNITS, "name")
+    return f"{name}, {unit}" if has_unit else name
+
+
+def _make_value_row(row: AxisRow) -> list[str]:
+    """Return a value of an axis, a bar of its accuracy, and the accuracy in numbers."""
+    # An unknown accuracy has an empty bar, as 0 has.
+    n_filled = round((row.accuracy or 0.0) * BAR_LENGTH)
+    bar = "#" * n_filled
+    accuracy, interval = _make_accuracy_cells(row)
+    return [
+        wording.format_parameter_value(row.value),
+        bar.ljust(BAR_LENGTH, "."),
+        accuracy,
+        f"{row.correct} of {row.configurations}",
+        interval,
+    ]
 
 
 def _select_worst(rows: Sequence[AxisRow], count: int) -> list[AxisRow]:
@@ -601,10 +693,9 @@ def make_sweep_claims(result: SweepSummary) -> Iterator[Claim]:
         return
     population, note = _describe_population(result)
     if result.arms:
+        adversarial_run = result.arms.adversarial_run
         for pair in result.arms.pairs:
-            yield from _make_arm_claims(
-                result.arms.adversarial_run, pair, population, note
-            )
+            yield from _make_arm_claims(adversarial_run, pair, population, note)
         if result.arms.pairs:
             return  # the other claims would mix the clean scene and the adversarial one
     yield from _make_accuracy_claims(result, population, note)
@@ -612,19 +703,26 @@ def make_sweep_claims(result: SweepSummary) -> Iterator[Claim]:
     if distance:
         yield make_claim("measured", describe_detection_distance(distance), None)
     for rates in result.drives or ():
-        contents = "mean, with its interval over drives, then the worst drive"
-        values = "; ".join(_format_drive_clause(*row) for row in make_drive_rows(rates))
-        yield make_claim(
-            "measured", f"{drive_title(rates)} ({contents}): {values}.", None
-        )
-    verified = result.worst.verified if result.worst else None
-    if verified is not None:
-        yield make_claim(
-            "measured",
-            "In the worst of these configurations the model is wrong in "
-            f"{wording.format_rate(verified)}. No search looked for a worse one.",
-            make_rate_extent("wrong", verified),
-        )
+        yield _make_drive_claim(rates)
+    if result.worst is not None and result.worst.verified is not None:
+        yield _make_worst_claim(result.worst.verified)
+
+
+def _make_worst_claim(verified: VerifiedRate) -> Claim:
+    """Return how often the worst of the configurations is wrong, as a claim."""
+    text = (
+        "In the worst of these configurations the model is wrong in "
+        f"{wording.format_rate(verified)}. No search looked for a worse one."
+    )
+    return make_claim("measured", text, make_rate_extent("wrong", verified))
+
+
+def _make_drive_claim(rates: DriveRates) -> Claim:
+    """Return the rates of a model over drives as a claim."""
+    contents = "mean, with its interval over drives, then the worst drive"
+    values = "; ".join(_format_drive_clause(*row) for row in make_drive_rows(rates))
+    text = f"{drive_title(rates)} ({contents}): {values}."
+    return make_claim("measured", text, None)
 
 
 def _describe_population(result: SweepSummary) -> tuple[str, str]:
@@ -638,23 +736,9 @@ def _describe_population(result: SweepSummary) -> tuple[str, str]:
     if not is_sampled and result.grid:
         return _describe_grid_population(result)
     if not is_sampled:
-        population = "configurations"
-        if result.drives:
-            population = _name_frames(result.drives)
-        note = (
-            " How these were selected is unknown; the interval takes them as a sample."
-        )
-        return population, note
-
+        return _describe_imported_population(result)
     if result.drives:
-        # The frames are the grid; what else differs between drives is sampled.
-        population = (
-            f"{_name_frames(result.drives)}; what else differs between drives is drawn "
-            f"at random ({result.sampler})"
-        )
-        note = " The interval is over drives, as if these were independent."
-        return population, "" if result.sampler == "random" else note
-
+        return _describe_sampled_drives(result.drives, result.sampler)
     has_independent_draws = result.sampler == "random" and not result.grid
     if has_independent_draws:
         return "configurations drawn at random from the stated ranges", ""
@@ -662,6 +746,30 @@ def _describe_population(result: SweepSummary) -> tuple[str, str]:
     if result.grid:
         population += " at each point of a grid"
     note = " The interval is that of independent draws, which these are not."
+    return population, note
+
+
+def _describe_sampled_drives(
+    drives: Sequence[DriveRates], sampler: str | None
+) -> tuple[str, str]:
+    """Return what the rates of sampled drives are over, and a caution.
+
+    The frames are the grid; what else differs between drives is sampled.
+    """
+    population = (
+        f"{_name_frames(drives)}; what else differs between drives is drawn "
+        f"at random ({sampler})"
+    )
+    note = " The interval is over drives, as if these were independent."
+    return population, "" if sampler == "random" else note
+
+
+def _describe_imported_population(result: SweepSummary) -> tuple[str, str]:
+    """Return what the rates of imported rows are over, and a caution."""
+    population = "configurations"
+    if result.drives:
+        population = _name_frames(result.drives)
+    note = " How these were selected is unknown; the interval takes them as a sample."
     return population, note
 
 
@@ -700,15 +808,11 @@ def _make_arm_claims(
         f"the adversarial scene of {adversarial_run}": pair.adversarial,
     }
     for arm, counts in arms.items():
-        extent = _make_accuracy_extent(
-            f"configurations of {arm} in which {pair.model} is right", counts
-        )
+        contents = f"configurations of {arm} in which {pair.model} is right"
+        extent = _make_accuracy_extent(contents, counts)
         accuracy = format_extent(extent)
-        yield make_claim(
-            "measured",
-            f"With {arm} {pair.model} is right in {accuracy} {population}.{note}",
-            extent,
-        )
+        text = f"With {arm} {pair.model} is right in {accuracy} {population}.{note}"
+        yield make_claim("measured", text, extent)
     yield make_claim("measured", format_paired_rates(adversarial_run, pair), None)
 
 
@@ -722,16 +826,37 @@ def _make_accuracy_claims(
         population: description of what the rates are over, "points of the grid" say.
         note: a caution about the interval.
     """
-    # Objects and environments are not sampled: each has the same number of images.
+    population += _describe_unsampled(result)
+    contents = "configurations in which the model is right"
+    for model, counts in _count_by_model(result).items():
+        extent = _make_accuracy_extent(contents, counts)
+        outcomes = wording.format_outcomes(counts.outcomes, result.task)
+        others = f" Of the others: {outcomes}." if outcomes else ""
+        text = (
+            f"{model} is right in {format_extent(extent)} {population}.{others}{note}"
+        )
+        yield make_claim("measured", text, extent)
+
+
+def _describe_unsampled(result: SweepSummary) -> str:
+    """Return what is not sampled, objects and environments, as the end of a clause.
+
+    Each of them has the same number of images.
+    """
     fixed = list[str]()
     for name in ("object", "environment"):
         n_values = sum(row.axis == name for row in result.axes)
         if n_values > 1:
             fixed.append(f"each of the {n_values} {name}s")
-    if fixed:
-        population += f", as many in {' and '.join(fixed)}"
-    # Each model has a claim of its own: models get the same images, so that their
-    # predictions are not independent of each other.
+    return f", as many in {' and '.join(fixed)}" if fixed else ""
+
+
+def _count_by_model(result: SweepSummary) -> dict[str, CountedPredictions]:
+    """Return the counts of each model by its name, as a sentence begins with it.
+
+    Each model has a claim of its own: models get the same images, so that their
+    predictions are not independent of each other.
+    """
     counts_by_model = dict[str, CountedPredictions]()
     if len(split_names(result.model)) > 1:
         for row in result.axes:
@@ -739,17 +864,7 @@ def _make_accuracy_claims(
                 counts_by_model[f"The model {row.value}"] = row
     if not counts_by_model:
         counts_by_model["The model"] = result
-    for model, counts in counts_by_model.items():
-        extent = _make_accuracy_extent(
-            "configurations in which the model is right", counts
-        )
-        outcomes = wording.format_outcomes(counts.outcomes, result.task)
-        others = f" Of the others: {outcomes}." if outcomes else ""
-        yield make_claim(
-            "measured",
-            f"{model} is right in {format_extent(extent)} {population}.{others}{note}",
-            extent,
-        )
+    return counts_by_model
 
 
 def _format_drive_clause(name: str, mean: str, interval: str, worst: str) -> str:
@@ -802,31 +917,36 @@ def make_drive_rows(drive_rates: DriveRates) -> list[tuple[str, str, str, str]]:
 
     An unknown rate has no row; a missing interval is a dash.
     """
-    tracks = drive_rates.tracks
     never = f", never in {drive_rates.never_right}" if drive_rates.never_right else ""
+    distance_unit = f" {drive_rates.unit}"
+    first_right = drive_rates.first_right
     # tuples of a name, the values, their unit, and a remark after the mean
     rates: list[tuple[str, OverDrives | None, str, str]] = [
         ("frames in which it is right", drive_rates.right, PERCENT, ""),
-        (
-            "first right at a distance of",
-            drive_rates.first_right,
-            f" {drive_rates.unit}",
-            never,
-        ),
+        ("first right at a distance of", first_right, distance_unit, never),
         ("longest gap", drive_rates.longest_gap, " s", ""),
         ("changes a second", drive_rates.flicker, "", ""),
+        *_list_track_rates(drive_rates),
     ]
-    if tracks is not None:
-        rates += [
-            ("frames without its track", tracks.lost, PERCENT, ""),
-            ("frames with a loose track instead", tracks.loose, PERCENT, ""),
-            ("identity switches", tracks.switches, "", ""),
-            ("longest gap of its track", tracks.longest_gap, " s", ""),
-        ]
     return [
         _format_drive_row(name, value, unit, remark)
         for name, value, unit, remark in rates
         if value is not None
+    ]
+
+
+def _list_track_rates(
+    drive_rates: DriveRates,
+) -> list[tuple[str, OverDrives | None, str, str]]:
+    """Return name, values, unit and remark of each rate of tracks; none without tracks."""
+    tracks = drive_rates.tracks
+    if tracks is None:
+        return []
+    return [
+        ("frames without its track", tracks.lost, PERCENT, ""),
+        ("frames with a loose track instead", tracks.loose, PERCENT, ""),
+        ("identity switches", tracks.switches, "", ""),
+        ("longest gap of its track", tracks.longest_gap, " s", ""),
     ]
 
 
@@ -860,31 +980,44 @@ def surface_sentences(surface: SurfaceMap) -> list[str]:
     sentences = []
     for table in surface.tables:
         # The faces of a mesh may be counted, too; the sentence is about cells.
-        if table.part != "cell":
-            continue
-        cells = format_count(table.compared, table.part)
-        if not table.compared:
-            text = (
-                f"no {table.part} was seen in {surface.min_pictures} pictures and hidden in "
-                "as many, so nothing is compared."
-            )
-        elif not table.worse + table.better:
-            text = f"none of {cells} that were compared is told from chance."
-        else:
-            text = (
-                f"of {cells} that were compared, {table.worse} go with wrong "
-                f"predictions and {table.better} with right ones."
-            )
-            if table.strongest:
-                first = table.strongest[0]
-                text += (
-                    f" The clearest, at u {first.u:.2f} and v {first.v:.2f}: wrong in "
-                    f"{format_error_rate(first.visible)} that see it, "
-                    f"{format_error_rate(first.hidden)} that do not."
-                )
-        names = f"{shorten_name(table.object)}, {shorten_name(table.model)}"
-        sentences.append(f"{names}: {text}")
+        if table.part == "cell":
+            names = f"{shorten_name(table.object)}, {shorten_name(table.model)}"
+            text = _compared_cells_text(table, surface.min_pictures)
+            sentences.append(f"{names}: {text}")
     return sentences
+
+
+def _compared_cells_text(table: SurfaceTable, min_images: int) -> str:
+    """Return how many cells of a surface go with wrong predictions, as a sentence.
+
+    Args:
+        table: counts of the cells of one object and one model.
+        min_images: images that a cell has to be seen in, and hidden in.
+    """
+    cells = format_count(table.compared, table.part)
+    if not table.compared:
+        return (
+            f"no {table.part} was seen in {min_images} pictures and hidden in "
+            "as many, so nothing is compared."
+        )
+    if not table.worse + table.better:
+        return f"none of {cells} that were compared is told from chance."
+    text = (
+        f"of {cells} that were compared, {table.worse} go with wrong "
+        f"predictions and {table.better} with right ones."
+    )
+    return (
+        f"{text} {_clearest_cell_text(table.strongest[0])}" if table.strongest else text
+    )
+
+
+def _clearest_cell_text(part: SurfacePart) -> str:
+    """Return how often the model is wrong with and without a cell, as a sentence."""
+    return (
+        f"The clearest, at u {part.u:.2f} and v {part.v:.2f}: wrong in "
+        f"{format_error_rate(part.visible)} that see it, "
+        f"{format_error_rate(part.hidden)} that do not."
+    )
 
 
 def format_error_rate(counts: CountedPredictions) -> str:
@@ -894,6 +1027,9 @@ def format_error_rate(counts: CountedPredictions) -> str:
 
 DISTANCE = "camera.distance"  # name of the axis
 HALF = 0.5
+# significance of all one-sided binomial tests of a bound together; both bounds together
+# have 95 % confidence
+BOUND_SIGNIFICANCE = 0.025
 
 
 @dataclass(frozen=True)
@@ -947,6 +1083,14 @@ def find_detection_distance(summary: SweepSummary) -> DetectionDistance | None:
     independent images are needed.
     """
     rows = [row for row in summary.axes if row.axis == DISTANCE and row.configurations]
+    has_distances = len(rows) > 1
+    if not has_distances or not _can_measure_distance(summary):
+        return None
+    return compute_detection_distance(rows)
+
+
+def _can_measure_distance(summary: SweepSummary) -> bool:
+    """Return whether a sweep detects one object with one model in independent images."""
     # A task may have options, as in "detection=..."
     task_name = summary.task.partition("=")[0]
     is_detection = task_name == "detection"
@@ -956,9 +1100,7 @@ def find_detection_distance(summary: SweepSummary) -> DetectionDistance | None:
     # Frames of a drive are not independent. Neither are images that share a draw; then
     # `units` is the number of draws.
     are_independent = summary.drives is None and summary.units is None
-    if is_comparison or not (is_detection and is_single and are_independent):
-        return None
-    return compute_detection_distance(rows) if len(rows) > 1 else None
+    return is_detection and is_single and are_independent and not is_comparison
 
 
 def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
@@ -975,26 +1117,17 @@ def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
     Raises:
         InputError: there are fewer than two distances.
     """
-    if len(rows) < 2:
-        raise InputError(
-            "detection distance: expected at least two distances, got "
-            f"{len(rows)}; sweep over more"
-        )
+    _check_distance_count(len(rows))
     rows = sorted(rows, key=_center_distance)
     distances = tuple(_center_distance(row) for row in rows)
     k = np.array([row.correct for row in rows])  # right images at each distance
     n = np.array([row.configurations for row in rows])  # images
-    # significance of a one-sided binomial test at one of the distances: 2.5 %, divided
-    # by the number of tests (Bonferroni)
-    significance = 0.025 / len(rows)
+    # significance of the test at one of the distances (Bonferroni)
+    significance = BOUND_SIGNIFICANCE / len(rows)
     low, high = _bound_distance(np.array(distances), k, n, significance)
     dips = find_dips(distances, k, n)
     beyond_dips = slice(_find_first_beyond_dips(distances, dips), None)
     fitted_fractions = _fit_falling(k[beyond_dips], n[beyond_dips])
-    # If each image is right with probability one half, n images are all right with
-    # probability 2**-n. The smallest n for which that is below the significance:
-    min_images = math.floor(-math.log2(significance)) + 1
-    has_enough_images = bool((n >= min_images).any())
     return DetectionDistance(
         unit=rows[0].unit,
         distances=distances,
@@ -1003,13 +1136,36 @@ def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
         distance=_find_crossing(np.array(distances[beyond_dips]), fitted_fractions),
         lower=low,
         upper=high,
-        min_images=None if has_enough_images else min_images,
+        min_images=_find_required_images(n, significance),
         loose_counts=_count_loose(rows),
         image_counts=tuple(n.tolist()),
         dips=dips,
         # The last one is the smallest.
         is_above_half=bool(fitted_fractions[-1] >= HALF),
     )
+
+
+def _check_distance_count(n_distances: int) -> None:
+    """Raise an error if there are fewer than two distances."""
+    if n_distances < 2:
+        raise InputError(
+            "detection distance: expected at least two distances, got "
+            f"{n_distances}; sweep over more"
+        )
+
+
+def _find_required_images(n: NDArray[np.int64], significance: float) -> int | None:
+    """Return how many images a bound needs; None if some distance has as many.
+
+    Args:
+        n: (m,) number of images at each distance.
+        significance: significance of a one-sided binomial test of one half.
+    """
+    # If each image is right with probability one half, n images are all right with
+    # probability 2**-n. The smallest n for which that is below the significance:
+    min_images = math.floor(-math.log2(significance)) + 1
+    has_enough_images = bool((n >= min_images).any())
+    return None if has_enough_images else min_images
 
 
 def _find_first_beyond_dips(distances: Sequence[float], dips: Sequence[Dip]) -> int:
@@ -1095,33 +1251,41 @@ def describe_detection_distance(estimate: DetectionDistance) -> str:
     loose boxes follow.
     """
     unit = "m" if estimate.unit == "metres" else estimate.unit
-    distance = None if estimate.distance is None else f"{estimate.distance:.3g}"
     interval = _interval_clause(estimate, unit)
     dips = _dips_sentences(estimate, unit)
     loose = _loose_sentence(estimate, unit)
-    farthest = f"{estimate.distances[-1]:.3g} {unit}"
     if not estimate.is_monotone:
         # The dips come first: the estimate is only about what is beyond them.
-        beyond = _clause_beyond_dips(estimate, distance, farthest, unit)
+        beyond = _clause_beyond_dips(estimate, unit)
         return " ".join(filter(None, [*dips, f"{beyond}; {interval}.", loose]))
-    if distance is not None:
-        sentence = f"Seen from {distance} {unit} in half of the pictures, {interval}."
-    elif estimate.is_above_half:
-        sentence = (
-            "Seen in at least half of the pictures up to the farthest distance, "
-            f"{farthest}; {interval}."
-        )
-    else:
-        sentence = (
-            f"Not seen in half of the pictures, even from {estimate.distances[0]:.3g} "
-            f"{unit}; {interval}."
-        )
+    sentence = _estimate_sentence(estimate, unit, interval)
     return " ".join(filter(None, [sentence, *dips, loose]))
 
 
-def _clause_beyond_dips(
-    estimate: DetectionDistance, distance: str | None, farthest: str, unit: str
-) -> str:
+def _estimate_sentence(estimate: DetectionDistance, unit: str, interval: str) -> str:
+    """Return the estimate of a detection distance without dips, as a sentence.
+
+    Args:
+        estimate: the estimate.
+        unit: unit of distances.
+        interval: its interval as a clause.
+    """
+    if estimate.distance is not None:
+        distance = f"{estimate.distance:.3g} {unit}"
+        return f"Seen from {distance} in half of the pictures, {interval}."
+    if estimate.is_above_half:
+        farthest = f"{estimate.distances[-1]:.3g} {unit}"
+        return (
+            "Seen in at least half of the pictures up to the farthest distance, "
+            f"{farthest}; {interval}."
+        )
+    return (
+        f"Not seen in half of the pictures, even from {estimate.distances[0]:.3g} "
+        f"{unit}; {interval}."
+    )
+
+
+def _clause_beyond_dips(estimate: DetectionDistance, unit: str) -> str:
     """Return how often the model is right beyond the last dip of its detections.
 
     A dip is a distance at which the object is detected less often than farther away.
@@ -1130,16 +1294,15 @@ def _clause_beyond_dips(
 
     Args:
         estimate: estimate of the detection distance.
-        distance: the estimated distance; None if the line does not cross one half.
-        farthest: the farthest distance with images, with its unit.
-        unit: unit of the distance.
+        unit: unit of distances.
     """
-    if distance is not None:
-        return f"Beyond that the share falls below a half at {distance} {unit}"
+    if estimate.distance is not None:
+        distance = f"{estimate.distance:.3g} {unit}"
+        return f"Beyond that the share falls below a half at {distance}"
     if estimate.is_above_half:
         return (
             "Beyond that it is right in at least half of the pictures, up to "
-            f"{farthest}"
+            f"{estimate.distances[-1]:.3g} {unit}"
         )
     return "Beyond that it is right in less than half of the pictures"
 
@@ -1153,22 +1316,25 @@ def _interval_clause(estimate: DetectionDistance, unit: str) -> str:
         estimate: estimate of the detection distance.
         unit: unit of distances.
     """
-    low = None if estimate.lower is None else f"{estimate.lower:.3g}"
-    high = None if estimate.upper is None else f"{estimate.upper:.3g}"
-    if low is not None and high is not None:
-        bounds = f"{low} to {high} {unit}"
-    elif low is not None:
-        bounds = f"at least {low} {unit}"
-    elif high is not None:
-        bounds = f"at most {high} {unit}"
-    else:
-        bounds = "no bound"
-    clause = f"{bounds} with 95 % confidence"
+    clause = f"{_format_bounds(estimate, unit)} with 95 % confidence"
     if estimate.min_images is not None:
         clause += (
             f" (that takes at least {estimate.min_images} pictures at each distance)"
         )
     return clause
+
+
+def _format_bounds(estimate: DetectionDistance, unit: str) -> str:
+    """Return the bounds of the detection distance: both, one, or "no bound"."""
+    low = None if estimate.lower is None else f"{estimate.lower:.3g}"
+    high = None if estimate.upper is None else f"{estimate.upper:.3g}"
+    if low is not None and high is not None:
+        return f"{low} to {high} {unit}"
+    if low is not None:
+        return f"at least {low} {unit}"
+    if high is not None:
+        return f"at most {high} {unit}"
+    return "no bound"
 
 
 def _dips_sentences(estimate: DetectionDistance, unit: str) -> list[str]:
@@ -1233,14 +1399,12 @@ def _loose_sentence(estimate: DetectionDistance, unit: str) -> str:
     """
     if not sum(estimate.loose_counts):
         return ""
+    counts = zip(
+        estimate.distances, estimate.loose_counts, estimate.image_counts, strict=True
+    )
     clauses = [
         f"{n_loose} of {n_images} at {distance:.3g} {unit}"
-        for distance, n_loose, n_images in zip(
-            estimate.distances,
-            estimate.loose_counts,
-            estimate.image_counts,
-            strict=True,
-        )
+        for distance, n_loose, n_images in counts
         if n_loose
     ]
     return (
@@ -1254,15 +1418,13 @@ def _add_loose_fractions(estimate: DetectionDistance) -> list[float]:
 
     That is the fraction of right images plus that of images with only a loose box.
     """
-    return [
-        fraction + n_loose / n_images
-        for fraction, n_loose, n_images in zip(
-            estimate.right_fractions,
-            estimate.loose_counts,
-            estimate.image_counts,
-            strict=True,
-        )
-    ]
+    counts = zip(
+        estimate.right_fractions,
+        estimate.loose_counts,
+        estimate.image_counts,
+        strict=True,
+    )
+    return [fraction + n_loose / n_images for fraction, n_loose, n_images in counts]
 
 
 def draw_detection_distance(estimate: DetectionDistance, axes: Any) -> None:
@@ -1274,32 +1436,7 @@ def draw_detection_distance(estimate: DetectionDistance, axes: Any) -> None:
         estimate: estimate of the detection distance.
         axes: axes of matplotlib.
     """
-    low, high = zip(*estimate.intervals, strict=True)
-    axes.fill_between(
-        estimate.distances,
-        low,
-        high,
-        color=BLUE,
-        alpha=0.15,
-        linewidth=0,
-        label="95 % interval",
-    )
-    axes.plot(
-        estimate.distances,
-        estimate.right_fractions,
-        color=BLUE,
-        marker="o",
-        label="seen in",
-    )
-    if any(estimate.loose_counts):
-        axes.plot(
-            estimate.distances,
-            _add_loose_fractions(estimate),
-            color=GREY,
-            marker=".",
-            linestyle=":",
-            label="or in a loose box",
-        )
+    _draw_fractions(estimate, axes)
     axes.axhline(HALF, color=GREY, linewidth=1, linestyle=(0.0, (5.0, 4.0)))
     if estimate.distance is not None:
         axes.axvline(estimate.distance, color=GREY, linewidth=1)
@@ -1311,3 +1448,22 @@ def draw_detection_distance(estimate: DetectionDistance, axes: Any) -> None:
     axes.set_title("How far away it is seen")
     axes.grid(True)
     axes.legend()
+
+
+def _draw_fractions(estimate: DetectionDistance, axes: Any) -> None:
+    """Draw the fraction of detections at each distance, with its interval.
+
+    Args:
+        estimate: estimate of the detection distance.
+        axes: axes of matplotlib.
+    """
+    distances = estimate.distances
+    low, high = zip(*estimate.intervals, strict=True)
+    band = {"color": BLUE, "alpha": 0.15, "linewidth": 0, "label": "95 % interval"}
+    axes.fill_between(distances, low, high, **band)
+    fractions = estimate.right_fractions
+    axes.plot(distances, fractions, color=BLUE, marker="o", label="seen in")
+    if any(estimate.loose_counts):
+        loose_style = {"color": GREY, "marker": ".", "linestyle": ":"}
+        any_box = _add_loose_fractions(estimate)
+        axes.plot(distances, any_box, **loose_style, label="or in a loose box")

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ from advsearch.controls import Control
 from advsearch.engine.naming import make_configured_controls
 from advsearch.options import OUT_OF_VIEW
 from advsearch.questions.attack.result import save_drive, select_evenly
-from advsearch.questions.sweep.axes import Axis
+from advsearch.questions.sweep.axes import Axis, SceneConfigurations
 from advsearch.questions.sweep.job import Job, SceneLoader
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import (
@@ -77,22 +78,42 @@ def add_frame_axis(
         # the control "path" with its defaults
         (travelling,) = make_configured_controls(config, {"path": {}})
         sampled = (*sampled, travelling)
-    time_name = f"{travelling.name}.time"
-    path_name = f"{travelling.name}.{Control.PATH_PARAMETER}"
-    seconds = travelling.seconds  # from the first point of the path to its end
     grid = config.grid
+    time_name = f"{travelling.name}.time"
     if time_name not in grid:
-        n_frames = round(seconds * config.fps) + 1  # both ends have a frame
-        n_frames = max(2, n_frames)
-        grid = {**grid, time_name: f"0:{seconds:g}:{n_frames}"}
-    is_path_in_grid = path_name in grid
+        grid = {**grid, time_name: _make_frame_range(travelling.seconds, config.fps)}
+    return sampled, {**_make_path_axis(config, travelling), **grid}
+
+
+def _make_path_axis(config: SweepConfig, travelling: Any) -> dict[str, object]:
+    """Return the axis of the paths among which a control can choose, by its name.
+
+    There is none if the path is in the grid, set or sampled, or if there is one path.
+
+    Args:
+        config: the settings.
+        travelling: the control that travels.
+    """
+    path_name = f"{travelling.name}.{Control.PATH_PARAMETER}"
+    is_path_in_grid = path_name in config.grid
     is_path_set = Control.PATH_PARAMETER in travelling.specs
     is_sampled = config.samples is not None
-    if not (is_path_in_grid or is_path_set or is_sampled):
-        paths = _list_paths(travelling)
-        if paths:
-            grid = {path_name: paths, **grid}
-    return sampled, grid
+    if is_path_in_grid or is_path_set or is_sampled:
+        return {}
+    paths = _list_paths(travelling)
+    return {path_name: paths} if paths else {}
+
+
+def _make_frame_range(seconds: float, fps: float) -> str:
+    """Return the times of the frames of a path as a range FIRST:LAST:COUNT.
+
+    Args:
+        seconds: seconds from the first point of the path to its end.
+        fps: frames a second.
+    """
+    n_frames = round(seconds * fps) + 1  # both ends have a frame
+    n_frames = max(2, n_frames)
+    return f"0:{seconds:g}:{n_frames}"
 
 
 def _list_paths(travelling: Any) -> list[Any]:
@@ -134,17 +155,21 @@ def compute_distance_bounds(job: Job, axis: Axis) -> tuple[float, float] | None:
     highest = -math.inf
     for scene in range(len(job.scenes)):
         for configurations in job.load_configurations_by_size(scene).values():
-            controls = {
-                control.name: control for control in configurations.space.controls
-            }
-            control: Any = controls.get(axis.control_name)
-            if control is None or not control.travels:
+            control = _find_travelling_control(configurations, axis)
+            if control is None:
                 return None
             # over all paths that the control can take
             distances = control.compute_distances(times)
             lowest = min(lowest, float(distances.min()))
             highest = max(highest, float(distances.max()))
     return lowest, highest
+
+
+def _find_travelling_control(configurations: SceneConfigurations, axis: Axis) -> Any:
+    """Return the control of an axis, bound to a scene; None if it does not travel."""
+    controls = {control.name: control for control in configurations.space.controls}
+    control = controls.get(axis.control_name)
+    return control if control is not None and control.travels else None
 
 
 class _CompleteDrives(NamedTuple):
@@ -191,18 +216,9 @@ class Drives:
         assert time_index is not None
         self._job = job
         time_axis = job.axes[time_index]
-        # The units are the same in all scenes and for all sizes of images.
-        points_of_first_scene = job.load_configurations_by_size(0)
-        self._units = next(iter(points_of_first_scene.values())).independent_units
+        self._units = _find_independent_units(job)
         self._distance_bounds = compute_distance_bounds(job, time_axis)
-        # An array of this shape has an element for each row; the row's number is its
-        # index in the flat array.
-        shape = (
-            len(job.scenes),
-            *(len(axis.values) for axis in job.axes),
-            job.samples_per_grid_point,
-            len(job.models),
-        )
+        shape = _find_shape_of_rows(job)
         flags: Flags = np.full(shape, UNKNOWN, np.int8)
         # All models get the same image, so there is no axis for models.
         distance = np.full(shape[:-1], np.nan)
@@ -211,21 +227,27 @@ class Drives:
         self._distance_unit = "object sizes"
         # fills `flags` and `distance`, and the attributes above
         self._read_rows(rows, time_axis.control_name, flags, distance)
+        self._set_frames_in_order(flags, distance, time_index)
 
-        times = np.array([float(value) for value in time_axis.values])
+    def _set_frames_in_order(
+        self, flags: Flags, distance: npt.NDArray[np.float64], time_index: int
+    ) -> None:
+        """Set the times, and the arrays with the frames in the order of their times.
+
+        Args:
+            flags: (scenes, axes of the grid ..., samples, models) flags of the rows.
+            distance: the same shape without models, distances of the images.
+            time_index: index of the time among the axes of the grid.
+        """
+        time_values = self._job.axes[time_index].values
+        times = np.array([float(value) for value in time_values])
         order = np.argsort(times)
         self.times = times[order]
-        self.seconds = float(self.times[-1] - self.times[0])
-        row_numbers = np.arange(flags.size).reshape(shape)
-
-        def move_frames_last(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-            """Make the time the last axis, in ascending order."""
-            # The axis of the scenes comes before those of the grid.
-            return np.moveaxis(array, 1 + time_index, -1)[..., order]
-
-        self._outcomes = move_frames_last(flags)
-        self._row_numbers = move_frames_last(row_numbers)
-        self._distance = move_frames_last(distance)
+        self.seconds = float(self.times[-1] - self.times[0])  # of one drive
+        row_numbers = np.arange(flags.size).reshape(flags.shape)
+        self._outcomes = _move_frames_last(flags, time_index, order)
+        self._row_numbers = _move_frames_last(row_numbers, time_index, order)
+        self._distance = _move_frames_last(distance, time_index, order)
 
     def _read_rows(
         self,
@@ -253,19 +275,25 @@ class Drives:
         distance_name = f"{instance}.distance"
         for row in rows:
             image, model = divmod(row.step, len(job.models))
-            is_hidden = row.label == OUT_OF_VIEW
-            right_or_wrong = RIGHT if row.correct else WRONG
-            flags.flat[row.step] = HIDDEN if is_hidden else right_or_wrong
+            flags.flat[row.step] = _find_flag(row)
             if distance_name in row.values:
                 distance.flat[image] = float(str(row.values[distance_name]["value"]))
                 self._distance_unit = row.values[distance_name]["unit"]
             scene = image // job.images_per_scene
-            names = right_names.get((scene, model))
-            # Only detectors have names, and an old row may lack its boxes.
-            if names is not None and isinstance(row.payload, dict):
-                self._frame_of_step[row.step] = read_frame(row.payload, names)
+            self._store_boxes(row, right_names.get((scene, model)))
             if path_name in row.values:
                 self._path_of_step[row.step] = str(row.values[path_name]["value"])
+
+    def _store_boxes(self, row: Row, names: Collection[str] | None) -> None:
+        """Store the detected boxes of a row, if it has any.
+
+        Args:
+            row: the row.
+            names: names of the right classes; None if the model is no detector.
+        """
+        # A row of an older version may lack its boxes.
+        if names is not None and isinstance(row.payload, dict):
+            self._frame_of_step[row.step] = read_frame(row.payload, names)
 
     def _find_right_names(self) -> dict[tuple[int, int], Collection[str]]:
         """Return the names of the right classes by scene and model, of detectors."""
@@ -274,9 +302,8 @@ class Drives:
         for scene, named_scene in enumerate(job.scenes):
             for model, task in enumerate(job.tasks):
                 if isinstance(task, Detection):
-                    classes = task.find_right_classes(
-                        job.make_ground_truth_facts(named_scene, {})
-                    )
+                    facts = job.make_ground_truth_facts(named_scene, {})
+                    classes = task.find_right_classes(facts)
                     right_names[scene, model] = task.get_class_names(classes)
         return right_names
 
@@ -311,20 +338,23 @@ class Drives:
         without a complete drive are left out.
         """
         rates = list[DriveRates]()
-        named_scenes = self._job.scenes
-        # The arms of a comparison are the clean scenes and the adversarial ones. If
-        # nothing is compared, there is one arm, whose name is empty.
-        for arm in dict.fromkeys(named_scene.arm for named_scene in named_scenes):
-            scenes = [
-                scene
-                for scene, named_scene in enumerate(named_scenes)
-                if named_scene.arm == arm
-            ]
+        for arm, scenes in self._list_scenes_by_arm().items():
             for model in range(len(self._job.models)):
                 drives = self._select_complete(scenes, model)
                 if len(drives.outcomes):
                     rates.append(self._compute_rates(drives, model, arm))
         return rates
+
+    def _list_scenes_by_arm(self) -> dict[str, list[int]]:
+        """Return the indices of the scenes of each arm, by its name.
+
+        The arms of a comparison are the clean scenes and the adversarial ones. If
+        nothing is compared, there is one arm, whose name is empty.
+        """
+        scenes_by_arm: dict[str, list[int]] = {}
+        for scene, named_scene in enumerate(self._job.scenes):
+            scenes_by_arm.setdefault(named_scene.arm, []).append(scene)
+        return scenes_by_arm
 
     def _compute_rates(
         self, drives: _CompleteDrives, model: int, arm: str
@@ -337,54 +367,48 @@ class Drives:
             arm: name of the scene that they have, clean or adversarial; empty if the
                 sweep has no adversarial one.
         """
+        outcomes = drives.outcomes
         n_frames = len(self.times)
         first_distance = _first_right_distance(drives)
-        drive_records = self._describe_drives(drives, first_distance)
         # Only drives with a right frame have a distance of first detection.
-        has_right = np.asarray((drives.outcomes == RIGHT).any(axis=1))
-
-        # Drives of one draw differ only in noise and count as one. All frames of a
-        # drive have the same draw, so that of the first frame is looked up.
-        first_images = drives.row_numbers[:, 0] // len(self._job.models)
-        draw_of_drive = np.asarray(self._units.find_draw(first_images))  # (n,)
+        has_right = np.asarray((outcomes == RIGHT).any(axis=1))
+        draw_of_drive = self._find_draw_of_drives(drives)
         n_drives = len(np.unique(draw_of_drive))
         n_right_drives = len(np.unique(draw_of_drive[has_right]))
-        # The largest values that are possible: every frame is wrong, and the prediction
-        # changes from each frame to the next.
-        max_gap = n_frames * self._frame_interval
-        max_flicker = (n_frames - 1) / self.seconds
+        summarize = partial(summarize_drives, drive_of_value=draw_of_drive)
         return DriveRates(
             model=self._job.models[model].name,
             adversarial_run=arm or None,  # the name is empty without a comparison
             drives=n_drives,
-            repeats=math.ceil(len(drives.outcomes) / n_drives),
+            repeats=math.ceil(len(outcomes) / n_drives),
             frames=n_frames,
             seconds=self.seconds,
             # `min` or `max` selects the worst drive: it has the fewest right frames,
             # the longest gap, the smallest distance of the first detection.
-            right=summarize_drives(
-                _right_fraction(drives.outcomes), min, drive_of_value=draw_of_drive
-            ),
-            longest_gap=summarize_drives(
-                self._longest_gaps(drives.outcomes),
-                max,
-                bounds=(0.0, max_gap),
-                drive_of_value=draw_of_drive,
+            right=summarize(_right_fraction(outcomes), min),
+            longest_gap=summarize(
+                self._longest_gaps(outcomes), max, bounds=(0.0, self._max_gap)
             ),
             first_right=self._first_detection(
                 first_distance[has_right], draw_of_drive[has_right]
             ),
             unit=self._distance_unit,
             never_right=n_drives - n_right_drives,
-            flicker=summarize_drives(
-                self._changes_per_second(drives.outcomes),
-                max,
-                bounds=(0.0, max_flicker),
-                drive_of_value=draw_of_drive,
+            flicker=summarize(
+                self._changes_per_second(outcomes), max, bounds=(0.0, self._max_flicker)
             ),
             tracks=self._compute_track_rates(model, drives.row_numbers, draw_of_drive),
-            per_drive=drive_records,
+            per_drive=self._describe_drives(drives, first_distance),
         )
+
+    def _find_draw_of_drives(self, drives: _CompleteDrives) -> npt.NDArray[np.int64]:
+        """Return the draw (n,) of each drive.
+
+        Drives of one draw differ only in noise and count as one. All frames of a drive
+        have the same draw, so that of the first frame is looked up.
+        """
+        first_images = drives.row_numbers[:, 0] // len(self._job.models)
+        return np.asarray(self._units.find_draw(first_images))
 
     def _describe_drives(
         self, drives: _CompleteDrives, first_distance: npt.NDArray[np.float64]
@@ -400,7 +424,8 @@ class Drives:
         longest_gap = self._longest_gaps(drives.outcomes)
         flicker = self._changes_per_second(drives.outcomes)
         # A drive is identified by the row of its first frame.
-        first_steps = drives.row_numbers[:MAX_LISTED_DRIVES, 0].tolist()
+        first_frames = drives.row_numbers[:, 0]
+        first_steps = first_frames[:MAX_LISTED_DRIVES].tolist()
         return [
             DriveRecord(
                 row=step,
@@ -417,6 +442,16 @@ class Drives:
     def _frame_interval(self) -> float:
         """Seconds from one frame to the next."""
         return self.seconds / (len(self.times) - 1)
+
+    @property
+    def _max_gap(self) -> float:
+        """The longest possible gap in seconds: every frame is wrong."""
+        return len(self.times) * self._frame_interval
+
+    @property
+    def _max_flicker(self) -> float:
+        """The most changes a second that are possible: from each frame to the next."""
+        return (len(self.times) - 1) / self.seconds
 
     def _longest_gaps(self, flags: Flags) -> npt.NDArray[np.float64]:
         """Return the seconds (n,) of the longest run of wrong frames of each drive."""
@@ -474,10 +509,9 @@ class Drives:
         tracker = self._job.tracker
         if not isinstance(task, Detection):
             return None
-        if any(step not in self._frame_of_step for step in steps.flat):
+        frames = self._collect_frames(steps)
+        if frames is None:
             return None
-        # for each drive, its frames
-        frames = [[self._frame_of_step[step] for step in row] for row in steps.tolist()]
         tracked_drives = [
             track_drive(drive_frames, tracker, task.iou) for drive_frames in frames
         ]
@@ -487,27 +521,32 @@ class Drives:
         switches = np.array(
             [tracked.switches for tracked in tracked_drives], dtype=float
         )
-        longest_gap = np.array([tracked.gap for tracked in tracked_drives], dtype=float)
-        n_frames = len(self.times)
-        seconds_bounds = (0.0, n_frames * self._frame_interval)
-
+        max_switches = len(self.times) - 1.0  # one between any two frames
+        gaps = np.array([tracked.gap for tracked in tracked_drives], dtype=float)
+        summarize = partial(summarize_drives, drive_of_value=drive)
         # In the worst drive each of these rates is largest: therefore `max`.
         return TrackRates(
             tracker=str(getattr(tracker, "__name__", type(tracker).__name__)),
-            lost=summarize_drives(lost, max, drive_of_value=drive),
+            lost=summarize(lost, max),
             # frames that are lost, but not if a small overlap is enough
-            loose=summarize_drives(lost - lost_loosely, max, drive_of_value=drive),
-            # at most one switch between two frames
-            switches=summarize_drives(
-                switches, max, bounds=(0.0, n_frames - 1.0), drive_of_value=drive
-            ),
-            longest_gap=summarize_drives(
-                longest_gap * self._frame_interval,
-                max,
-                bounds=seconds_bounds,
-                drive_of_value=drive,
+            loose=summarize(lost - lost_loosely, max),
+            switches=summarize(switches, max, bounds=(0.0, max_switches)),
+            longest_gap=summarize(
+                gaps * self._frame_interval, max, bounds=(0.0, self._max_gap)
             ),
         )
+
+    def _collect_frames(
+        self, steps: npt.NDArray[np.int64]
+    ) -> list[list[DetectedFrame]] | None:
+        """Return the frames of each drive; None unless every frame has its boxes.
+
+        Args:
+            steps: (n, frames) numbers of the rows.
+        """
+        if any(step not in self._frame_of_step for step in steps.flat):
+            return None
+        return [[self._frame_of_step[step] for step in row] for row in steps.tolist()]
 
     def save_worst(self, scenes: SceneLoader, run: RunDirectory) -> None:
         """Save a strip and an animation of the first model's worst drive.
@@ -527,17 +566,69 @@ class Drives:
         worst = _right_fraction(drives.outcomes).argmin()
         # rows are numbered by image, then model
         image_numbers = drives.row_numbers[worst] // len(self._job.models)
-        animated_frames = []
         selected = select_evenly(len(image_numbers), MAX_ANIMATED_FRAMES)
-        for number in image_numbers[selected].tolist():
-            scene, queries = scenes.make_queries(number)
-            query = queries[0]  # of the first model
-            image = scene.render_image(query)
-            marks = scene.problems[0].find_marks(image, query.u)
-            animated_frames.append(
-                np.asarray(draw_marks(image.numpy(), marks), dtype=np.float32)
-            )
+        animated_frames = [
+            _render_marked(scenes, number)
+            for number in image_numbers[selected].tolist()
+        ]
         save_drive(run, "drive", animated_frames, self.seconds)
+
+
+def _find_independent_units(job: Job) -> Units:
+    """Return the independent units of the images of a sweep.
+
+    They are the same in all scenes and for all sizes of images.
+    """
+    configurations_by_size = job.load_configurations_by_size(0)
+    return next(iter(configurations_by_size.values())).independent_units
+
+
+def _find_shape_of_rows(job: Job) -> tuple[int, ...]:
+    """Return the shape of an array with an element for each row of a sweep.
+
+    The number of a row is its index in the flat array.
+    """
+    return (
+        len(job.scenes),
+        *(len(axis.values) for axis in job.axes),
+        job.samples_per_grid_point,
+        len(job.models),
+    )
+
+
+def _move_frames_last(
+    array: npt.NDArray[Any], time_index: int, order: npt.NDArray[np.intp]
+) -> npt.NDArray[Any]:
+    """Make the time the last axis of an array, in ascending order.
+
+    Args:
+        array: (scenes, axes of the grid ..., ...).
+        time_index: index of the time among the axes of the grid.
+        order: (frames,) indices of the times in ascending order.
+    """
+    # The axis of the scenes comes before those of the grid.
+    return np.moveaxis(array, 1 + time_index, -1)[..., order]
+
+
+def _find_flag(row: Row) -> int:
+    """Return whether a row is HIDDEN, RIGHT or WRONG."""
+    if row.label == OUT_OF_VIEW:
+        return HIDDEN
+    return RIGHT if row.correct else WRONG
+
+
+def _render_marked(scenes: SceneLoader, number: int) -> npt.NDArray[np.float32]:
+    """Render an image (H, W, 3) of the first model, with the marks of its task.
+
+    Args:
+        scenes: scenes of the sweep.
+        number: number of the image.
+    """
+    scene, queries = scenes.make_queries(number)
+    query = queries[0]  # of the first model
+    image = scene.render_image(query)
+    marks = scene.problems[0].find_marks(image, query.u)
+    return np.asarray(draw_marks(image.numpy(), marks), dtype=np.float32)
 
 
 def _compute_lost_loosely(
@@ -608,11 +699,23 @@ def summarize_drives(
     """
     means = values
     if drive_of_value is not None:
-        n_values = sum_per_unit(np.ones(len(values)), drive_of_value)
-        means = sum_per_unit(values, drive_of_value) / n_values
+        means = _average_per_drive(values, drive_of_value)
     interval = None
     if bounds is not None and len(means) > 1:
         interval = mean_interval(means, *bounds)
     # The worst value is that of a single evaluation, with the noise that it had.
     worst_value = worst(values.tolist())
     return OverDrives(mean=float(means.mean()), interval=interval, worst=worst_value)
+
+
+def _average_per_drive(
+    values: npt.NDArray[np.float64], drive_of_value: npt.NDArray[np.int64]
+) -> npt.NDArray[np.float64]:
+    """Return the mean of the values (n,) of each drive.
+
+    Args:
+        values: (n,) the values.
+        drive_of_value: (n,) the drive of each value.
+    """
+    n_values = sum_per_unit(np.ones(len(values)), drive_of_value)
+    return np.asarray(sum_per_unit(values, drive_of_value) / n_values)

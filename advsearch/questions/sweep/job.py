@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import TypeAlias
@@ -39,6 +39,7 @@ from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import WorstVerified
 from advsearch.questions.sweep.tracks import ConstantVelocity, Tracker
 from advsearch.runs.directory import RunDirectory
+from advsearch.runs.results import VerifiedRate
 from advsearch.scene.color import round_to_8_bit
 from advsearch.scene.description import ENVIRONMENT, OBJECT
 from advsearch.scene.formation import round_sample_count
@@ -170,15 +171,18 @@ class Job:
         """
         if scene not in self._points_by_scene:
             self._points_by_scene.clear()
-            named_scene = self.scenes[scene]
-            sizes = dict.fromkeys(self.image_sizes)
             self._points_by_scene[scene] = {
-                size: self.make_scene_configurations(
-                    self.bind_controls(named_scene, size)
-                )
-                for size in sizes
+                size: self._make_configurations_of_size(scene, size)
+                for size in dict.fromkeys(self.image_sizes)
             }
         return self._points_by_scene[scene]
+
+    def _make_configurations_of_size(
+        self, scene: int, size: ImageSize
+    ) -> SceneConfigurations:
+        """Return the configurations of a scene for one size of images."""
+        space = self.bind_controls(self.scenes[scene], size)
+        return self.make_scene_configurations(space)
 
     def make_queries(self, numbers: range) -> list[WorkItem]:
         """Return the queries of all models about images of one scene.
@@ -203,15 +207,22 @@ class Job:
                 first_in_scene, len(numbers), before=images_before
             )
             descriptions = configurations.describe_images(all_u, first_in_scene)
+            models = self.list_models_of_size(size)
             for number, u, values in zip(numbers, all_u, descriptions, strict=True):
-                queries += [
-                    self._make_query(number, model, configurations, u, values)
-                    for model, model_size in enumerate(self.image_sizes)
-                    if model_size == size
-                ]
+                for model in models:
+                    query = self._make_query(number, model, configurations, u, values)
+                    queries.append(query)
         # The loop above is by size; rows are by image, then by model.
         queries.sort(key=lambda query: query.row_index)
         return [(str(scene), None, query) for query in queries]
+
+    def list_models_of_size(self, size: ImageSize) -> list[int]:
+        """Return the indices of the models that get images of a size."""
+        return [
+            model
+            for model, model_size in enumerate(self.image_sizes)
+            if model_size == size
+        ]
 
     def _make_query(
         self,
@@ -263,12 +274,8 @@ class Job:
                 if the scene keeps its own.
             values: values of the controls.
         """
-        named_scene = self.scenes[scene]
-        fixed_names = {control.name for control in named_scene.fixed_controls}
-        names = named_scene.value_of_scene_axis  # a new dict, which may be changed
-        if environment is not None:
-            names["environment"] = environment
-        names["model"] = self.models[model].name
+        fixed_names = {control.name for control in self.scenes[scene].fixed_controls}
+        names = self._name_row(scene, model, environment)
         row_values: dict[str, Value] = {
             name: {"value": text, "unit": ""} for name, text in names.items()
         }
@@ -277,6 +284,19 @@ class Job:
             if control_name not in fixed_names:
                 row_values[name] = value
         return row_values
+
+    def _name_row(
+        self, scene: int, model: int, environment: str | None
+    ) -> dict[str, str]:
+        """Return the names of scene and model in a row, by axis.
+
+        See `_make_row_values` for the arguments.
+        """
+        names = self.scenes[scene].value_of_scene_axis  # a new dict
+        if environment is not None:
+            names["environment"] = environment
+        names["model"] = self.models[model].name
+        return names
 
     def bind_controls(self, named_scene: NamedScene, size: ImageSize) -> Space:
         """Bind all controls of the sweep to a scene.
@@ -303,16 +323,7 @@ class Job:
         space = make_space(controls, description)
         if named_scene.fixed_controls:
             space = _fix_controls(named_scene, space)
-        # What the user fixed with `set` must not be sampled, except for the
-        # environment, for which `check_scenes` has other rules.
-        set_by_user = named_scene.scene.description.requested - {ENVIRONMENT}
-        for group in space.groups:
-            if group.setting in set_by_user:
-                raise InputError(
-                    f"`controls` {group.control}: draws {group.parameter} by chance, "
-                    f"and `set` {group.setting} fixes it; leave it out of one of the "
-                    "two"
-                )
+        _check_sampled_not_set(named_scene, space)
         return space
 
     def make_scene_configurations(self, space: Space) -> SceneConfigurations:
@@ -321,11 +332,11 @@ class Job:
         In a comparison without and with an adversarial configuration, the second half
         of the scenes are those with it. They repeat the draws of the first half.
         """
-        repeat_after_scenes = 0  # never
         # In a comparison every scene has the name of an arm, clean ones, too.
         is_comparison = bool(self.scenes[0].arm)
-        if is_comparison:
-            repeat_after_scenes = len(self.scenes) // 2
+        repeat_after_scenes = len(self.scenes) // 2 if is_comparison else 0  # 0: never
+        # one name without a folder of photographs: all are empty then
+        photograph_names = {scene.photograph_name for scene in self.scenes}
         return SceneConfigurations(
             space,
             make_domain(space.controls),
@@ -335,8 +346,7 @@ class Job:
             seed=self.config.seed,
             repeat_after_scenes=repeat_after_scenes,
             n_scenes=len(self.scenes),
-            # 1 without a folder of photographs: all names are empty then
-            n_photographs=len({scene.photograph_name for scene in self.scenes}),
+            n_photographs=len(photograph_names),
         )
 
     def make_ground_truth_facts(
@@ -385,6 +395,25 @@ def _fix_controls(named_scene: NamedScene, space: Space) -> Space:
     return space.fix_first_controls(named_scene.adversarial_configuration)
 
 
+def _check_sampled_not_set(named_scene: NamedScene, space: Space) -> None:
+    """Raise an error if a sampled parameter is fixed with `set`.
+
+    Args:
+        named_scene: the scene.
+        space: space of what is sampled.
+    """
+    # What the user fixed with `set` must not be sampled, except for the environment, for
+    # which `check_scenes` has other rules.
+    set_by_user = named_scene.scene.description.requested - {ENVIRONMENT}
+    for group in space.groups:
+        if group.setting in set_by_user:
+            raise InputError(
+                f"`controls` {group.control}: draws {group.parameter} by chance, "
+                f"and `set` {group.setting} fixes it; leave it out of one of the "
+                "two"
+            )
+
+
 def check_scenes(
     named_scenes: Sequence[NamedScene],
     controls: Sequence[Control],
@@ -401,39 +430,67 @@ def check_scenes(
         InputError: an axis varies what `set` fixes, or an axis or a control chooses the
             environment although several environments are named.
     """
-    # settings that the user has fixed in any scene with `set`
-    fixed_settings = {
-        name
-        for named_scene in named_scenes
-        for name in named_scene.scene.description.requested
-    }
     # the axes and controls that choose the environment, as the user wrote them
-    environment_choices = list[str]()
-    for axis in axes:
-        setting = _find_setting(axis, controls)
-        # If `set` fixes the environment, an axis may still choose it.
-        if setting == ENVIRONMENT:
-            environment_choices.append(f"`grid` {axis.name}")
-        elif setting in fixed_settings:
-            raise InputError(
-                f"`grid` {axis.name}: `set` fixes it already; leave it "
-                "out of one of the two"
-            )
-    for control in controls:
-        for parameter in control.parameters:
-            # A control's settings contain the parameters that it varies.
-            is_varied = parameter.name in control.to_settings()
-            if control.get_setting_name(parameter) == ENVIRONMENT and is_varied:
-                environment_choices.append(f"`controls` {control.name}")
-    environments = list(
-        dict.fromkeys(named_scene.environment_name for named_scene in named_scenes)
-    )
+    environment_choices = [
+        *_list_environment_axes(named_scenes, controls, axes),
+        *_list_environment_controls(controls),
+    ]
+    all_environments = [scene.environment_name for scene in named_scenes]
+    environments = list(dict.fromkeys(all_environments))
     if len(environments) > 1 and environment_choices:
         raise InputError(
             f"`environment={','.join(environments)}` and {environment_choices[0]} both "
             "choose what lights the scene; name all of "
             "them in one of the two, and leave the other out"
         )
+
+
+def _list_environment_axes(
+    named_scenes: Sequence[NamedScene],
+    controls: Sequence[Control],
+    axes: Sequence[Axis],
+) -> list[str]:
+    """Return the axes that choose the environment, as the user wrote them.
+
+    See `check_scenes` for the arguments.
+
+    Raises:
+        InputError: an axis varies what `set` fixes.
+    """
+    fixed_settings = _find_fixed_settings(named_scenes)
+    environment_axes = list[str]()
+    for axis in axes:
+        setting = _find_setting(axis, controls)
+        # If `set` fixes the environment, an axis may still choose it.
+        if setting == ENVIRONMENT:
+            environment_axes.append(f"`grid` {axis.name}")
+        elif setting in fixed_settings:
+            raise InputError(
+                f"`grid` {axis.name}: `set` fixes it already; leave it "
+                "out of one of the two"
+            )
+    return environment_axes
+
+
+def _find_fixed_settings(named_scenes: Sequence[NamedScene]) -> set[str]:
+    """Return the settings that the user has fixed in any scene with `set`."""
+    return {
+        name
+        for named_scene in named_scenes
+        for name in named_scene.scene.description.requested
+    }
+
+
+def _list_environment_controls(controls: Sequence[Control]) -> list[str]:
+    """Return the controls that choose the environment, as the user wrote them."""
+    environment_controls = list[str]()
+    for control in controls:
+        for parameter in control.parameters:
+            # A control's settings contain the parameters that it varies.
+            is_varied = parameter.name in control.to_settings()
+            if control.get_setting_name(parameter) == ENVIRONMENT and is_varied:
+                environment_controls.append(f"`controls` {control.name}")
+    return environment_controls
 
 
 def _find_setting(axis: Axis, controls: Sequence[Control]) -> str:
@@ -462,25 +519,9 @@ def check_job(job: Job) -> tuple[SceneConfigurations, tuple[SampledNumber, ...]]
     Raises:
         InputError: controls sample other numbers in one scene than in another.
     """
-    # a pair for each scene and each size of images
-    pairs = list[tuple[NamedScene, SceneConfigurations]]()
-    for scene, named_scene in enumerate(job.scenes):
-        pairs += [
-            (named_scene, configurations)
-            for configurations in job.load_configurations_by_size(scene).values()
-        ]
-        facts = job.make_ground_truth_facts(named_scene, {})
-        for task, model in zip(job.tasks, job.models, strict=True):
-            check_truth(
-                task, model, named_scene.scene, facts, job.config.image_settings
-            )
+    pairs = _bind_all_scenes(job)
     _, first_configurations = pairs[0]
-    for named_scene, configurations in pairs:
-        if configurations.sampled_layout != first_configurations.sampled_layout:
-            raise InputError(
-                f"`object` {named_scene.object_name}: its controls draw other numbers than "
-                f"those of {job.scenes[0].object_name}; sweep the two by themselves"
-            )
+    _check_same_layout(pairs)
     # A number may have another range in another scene or size: it has a version in
     # each.
     numbers_of_pair = [configurations.sampled_numbers for _, configurations in pairs]
@@ -489,6 +530,41 @@ def check_job(job: Job) -> tuple[SceneConfigurations, tuple[SampledNumber, ...]]
         for versions in zip(*numbers_of_pair, strict=True)
     ]
     return first_configurations, tuple(sampled)
+
+
+def _bind_all_scenes(job: Job) -> list[tuple[NamedScene, SceneConfigurations]]:
+    """Return a pair for each scene and each size of images, and check the right labels.
+
+    Raises:
+        InputError: controls cannot be bound to a scene, or no prediction about it would
+            be right.
+    """
+    pairs = list[tuple[NamedScene, SceneConfigurations]]()
+    for scene, named_scene in enumerate(job.scenes):
+        pairs += [
+            (named_scene, configurations)
+            for configurations in job.load_configurations_by_size(scene).values()
+        ]
+        _check_truths(job, named_scene)
+    return pairs
+
+
+def _check_truths(job: Job, named_scene: NamedScene) -> None:
+    """Check that each model of a sweep can be right about a scene."""
+    facts = job.make_ground_truth_facts(named_scene, {})
+    for task, model in zip(job.tasks, job.models, strict=True):
+        check_truth(task, model, named_scene.scene, facts, job.config.image_settings)
+
+
+def _check_same_layout(pairs: Sequence[tuple[NamedScene, SceneConfigurations]]) -> None:
+    """Raise an error if controls sample other numbers in one scene than in another."""
+    first_scene, first_configurations = pairs[0]
+    for named_scene, configurations in pairs:
+        if configurations.sampled_layout != first_configurations.sampled_layout:
+            raise InputError(
+                f"`object` {named_scene.object_name}: its controls draw other numbers than "
+                f"those of {first_scene.object_name}; sweep the two by themselves"
+            )
 
 
 def _merge_versions(versions: Sequence[SampledNumber], n_parts: int) -> SampledNumber:
@@ -606,32 +682,21 @@ class SweptScene:
         """
         begin = time.perf_counter()
         not_finite_before = self.n_non_finite
-        n_models = len(self.job.models)
         images = {
             size: self._make_images(size, queries)
             for size in self.configurations_by_size
         }
         judgements = self._make_judgements(queries, images)
-        # queries are numbered by image, then by model
-        wrong_images = {
-            row_number // n_models
-            for row_number, judgement in judgements.items()
-            if not judgement.right
-        }
         # Queries are evaluated together, so each gets an equal part of the time.
         seconds = (time.perf_counter() - begin) / len(queries)
-        evaluations = self._make_evaluations(
-            queries, images, judgements, seconds, wrong_images
-        )
+        evaluations = self._make_evaluations(queries, images, judgements, seconds)
         # A predictor that was released since is no longer counted, so that the
         # difference could be negative.
         n_new_non_finite = max(0, self.n_non_finite - not_finite_before)
+        predictors = self.predictor_of_size.values()
+        summaries = [predictor.summarize() for predictor in predictors]
         evaluations[-1] = replace(
-            evaluations[-1],
-            collected_light=[
-                predictor.summarize() for predictor in self.predictor_of_size.values()
-            ],
-            n_non_finite=n_new_non_finite,
+            evaluations[-1], collected_light=summaries, n_non_finite=n_new_non_finite
         )
         return evaluations
 
@@ -641,7 +706,6 @@ class SweptScene:
         images: Mapping[ImageSize, Mapping[int, SweptImage]],
         judgements: Mapping[int, Judgement],
         seconds: float,
-        wrong_images: Collection[int],
     ) -> list[Evaluation]:
         """Return the evaluation of each query.
 
@@ -653,26 +717,54 @@ class SweptScene:
             images: images by size, then by the number of the image.
             judgements: judgements by the number of the query.
             seconds: seconds that each query took.
-            wrong_images: numbers of the images in which any model is wrong.
         """
+        wrong_images = self._find_wrong_images(judgements)
         evaluations = list[Evaluation]()
         for query in queries:
             number, model = divmod(query.row_index, len(self.job.models))
             image = images[self.job.image_sizes[model]][number]
-            # Models of one size share the image: its cost counts for the first.
-            cost = image.n_traced if self.job.is_first_of_size[model] else 0
-            evaluation = Evaluation.from_judgement(
-                judgements[query.row_index],
-                cost=cost,
-                # its samples per pixel; 0 if the image was rendered
-                predicted=image.prediction_spp,
-                seconds=seconds,
-            )
+            judgement = judgements[query.row_index]
+            evaluation = self._make_evaluation(model, image, judgement, seconds)
             if model == 0:
                 is_wrong = number in wrong_images
                 evaluation = self._attach_images(evaluation, query, image, is_wrong)
             evaluations.append(evaluation)
         return evaluations
+
+    def _make_evaluation(
+        self, model: int, image: SweptImage, judgement: Judgement, seconds: float
+    ) -> Evaluation:
+        """Return the evaluation of a query without images.
+
+        Args:
+            model: index of the model.
+            image: image of the query.
+            judgement: judgement of the image.
+            seconds: seconds that the query took.
+        """
+        # Models of one size share the image: its cost counts for the first.
+        cost = image.n_traced if self.job.is_first_of_size[model] else 0
+        return Evaluation.from_judgement(
+            judgement,
+            cost=cost,
+            # its samples per pixel; 0 if the image was rendered
+            predicted=image.prediction_spp,
+            seconds=seconds,
+        )
+
+    def _find_wrong_images(self, judgements: Mapping[int, Judgement]) -> set[int]:
+        """Return the numbers of the images in which any model is wrong.
+
+        Args:
+            judgements: judgements by the number of the query.
+        """
+        n_models = len(self.job.models)
+        # queries are numbered by image, then by model
+        return {
+            row_number // n_models
+            for row_number, judgement in judgements.items()
+            if not judgement.right
+        }
 
     def _make_judgements(
         self,
@@ -688,33 +780,40 @@ class SweptScene:
             queries: queries of all models.
             images: images by size, then by the number of the image.
         """
-        job = self.job
-        n_models = len(job.models)
+        n_models = len(self.job.models)
         judgement_of_query: dict[int, Judgement] = {}
-        for model, problem in enumerate(self.problems):  # one for each model
-            size = job.image_sizes[model]
+        for model in range(len(self.problems)):  # one for each model
             model_queries = [
                 query for query in queries if query.row_index % n_models == model
             ]
-            if not model_queries:
-                continue
-            batch = torch.stack(
-                [
-                    images[size][query.row_index // n_models].image
-                    for query in model_queries
-                ]
-            )
-            judgements = problem.judge_images(
-                batch,
-                [query.u for query in model_queries],
-                [query.values for query in model_queries],
-            )
-            judgements = self._add_change_metrics(
-                problem, size, model_queries, batch, judgements
-            )
-            for query, judgement in zip(model_queries, judgements, strict=True):
-                judgement_of_query[query.row_index] = judgement
+            if model_queries:
+                row_numbers = [query.row_index for query in model_queries]
+                judgements = self._judge_model(model, model_queries, images)
+                judgement_of_query |= zip(row_numbers, judgements, strict=True)
         return judgement_of_query
+
+    def _judge_model(
+        self,
+        model: int,
+        queries: Sequence[Query],
+        images: Mapping[ImageSize, Mapping[int, SweptImage]],
+    ) -> list[Judgement]:
+        """Return the judgements of the queries of one model.
+
+        Args:
+            model: index of the model.
+            queries: its queries.
+            images: images by size, then by the number of the image.
+        """
+        size = self.job.image_sizes[model]
+        problem = self.problems[model]
+        n_models = len(self.job.models)
+        image_numbers = [query.row_index // n_models for query in queries]
+        batch = torch.stack([images[size][number].image for number in image_numbers])
+        judgements = problem.judge_images(
+            batch, [query.u for query in queries], [query.values for query in queries]
+        )
+        return self._add_change_metrics(problem, size, queries, batch, judgements)
 
     def _attach_images(
         self, evaluation: Evaluation, query: Query, image: SweptImage, is_wrong: bool
@@ -736,13 +835,19 @@ class SweptScene:
             thumbnail = thumbnails.make_thumbnail(image.image)
             evaluation = replace(evaluation, jpeg=thumbnail)
         if job.aovs:
-            surfaces = self.renderer_of_size[job.image_sizes[0]].find_surfaces(query.u)
-            layers = {
-                name: layer.numpy()
-                for name, layer in surfaces.make_layers(job.aovs, OBJECT).items()
-            }
-            notes = surfaces.describe_layers(job.aovs)
-            evaluation = replace(evaluation, layers=(layers, notes))
+            evaluation = self._attach_layers(evaluation, query)
+        return evaluation
+
+    def _attach_layers(self, evaluation: Evaluation, query: Query) -> Evaluation:
+        """Return an evaluation of the first model with layers of ground truth."""
+        job = self.job
+        surfaces = self.renderer_of_size[job.image_sizes[0]].find_surfaces(query.u)
+        layers = {
+            name: layer.numpy()
+            for name, layer in surfaces.make_layers(job.aovs, OBJECT).items()
+        }
+        notes = surfaces.describe_layers(job.aovs)
+        evaluation = replace(evaluation, layers=(layers, notes))
         return evaluation
 
     def _add_change_metrics(
@@ -775,18 +880,9 @@ class SweptScene:
                 changed_images = self._render_empty(size, queries)
             else:
                 changed_images = _change_images(images, change, problem.model.cameras)
-            changed_judgements = problem.judge_images(
-                changed_images, configurations, values
-            )
-            for index, (before, after) in enumerate(
-                zip(judgements, changed_judgements, strict=True)
-            ):
-                is_met = meets_claim(claim, before.prediction, after.prediction)
-                metrics = {
-                    **(before.metrics or {}),
-                    f"{claim} {change}": float(is_met),
-                }
-                judgements[index] = replace(before, metrics=metrics)
+            after = problem.judge_images(changed_images, configurations, values)
+            metric = f"{claim} {change}"
+            judgements = _add_metric(judgements, after, claim, metric)
         return judgements
 
     def _render_empty(self, size: ImageSize, queries: Sequence[Query]) -> Tensor:
@@ -825,20 +921,33 @@ class SweptScene:
             size: the size.
             queries: queries of all models, which are numbered by image, then by model.
         """
-        n_models = len(self.job.models)
         images_before = self.number * self.configurations_by_size[size].n_images
-        # The predictor numbers the images of this scene from 0. Queries of several
-        # models about an image differ in nothing that concerns the image.
-        query_of_image = {
-            query.row_index // n_models - images_before: query
-            for query in queries
-            if self.job.image_sizes[query.row_index % n_models] == size
-        }
+        query_of_image = self._find_query_of_image(size, queries, images_before)
         with torch.no_grad():
             images = self.predictor_of_size[size].make_images(query_of_image)
         return {
             images_before + number: replace(image, image=round_to_8_bit(image.image))
             for number, image in images.items()
+        }
+
+    def _find_query_of_image(
+        self, size: ImageSize, queries: Sequence[Query], images_before: int
+    ) -> dict[int, Query]:
+        """Return a query of each image of a size, by the number of the image.
+
+        The predictor numbers the images of this scene from 0. Queries of several models
+        about an image differ in nothing that concerns the image.
+
+        Args:
+            size: the size.
+            queries: queries of all models, which are numbered by image, then by model.
+            images_before: number of images in the scenes before this one.
+        """
+        n_models = len(self.job.models)
+        return {
+            query.row_index // n_models - images_before: query
+            for query in queries
+            if self.job.image_sizes[query.row_index % n_models] == size
         }
 
     def render_image(self, query: Query) -> Tensor:
@@ -911,6 +1020,25 @@ def _change_images(images: Tensor, change: str, n_cameras: int) -> Tensor:
     return torch.stack([change_image(image, change, n_cameras) for image in images])
 
 
+def _add_metric(
+    before: Sequence[Judgement], after: Sequence[Judgement], claim: str, metric: str
+) -> list[Judgement]:
+    """Return judgements with the metric of a claim about changed images.
+
+    Args:
+        before: (n,) judgements of the unchanged images.
+        after: (n,) judgements of the changed images.
+        claim: the claim, such as "must_change".
+        metric: name of the metric, which is 1 if a prediction meets the claim, else 0.
+    """
+    judgements = list[Judgement]()
+    for judgement, changed in zip(before, after, strict=True):
+        is_met = meets_claim(claim, judgement.prediction, changed.prediction)
+        metrics = {**(judgement.metrics or {}), metric: float(is_met)}
+        judgements.append(replace(judgement, metrics=metrics))
+    return judgements
+
+
 def verify_worst(
     problem: Problem,
     config: SweepConfig,
@@ -941,26 +1069,42 @@ def verify_worst(
     ladder = choose_ladder(config.verify_spp, config.pixel_sampler)
     # The rows of a sweep state no success, so the journal stores none either; trials in
     # memory have one.
-    verifier = Verifier(
-        Journal(run, ParallelEvaluator(problem)), ladder, stages, has_success=False
-    )
+    journal = Journal(run, ParallelEvaluator(problem))
+    verifier = Verifier(journal, ladder, stages, has_success=False)
     verifier.choose_spp({"worst": u})  # sets `spp` and `sample_count` of its state
-    verifier.begin_stage(
-        "checking the worst configuration with fresh renders", config.trials
+    title = "checking the worst configuration with fresh renders"
+    verifier.begin_stage(title, config.trials)
+    verified_rate = _try_worst(verifier, config, u)
+    return WorstVerified(
+        **vars(verified_rate),
+        converged=_has_converged(verifier),
+        renders=verifier.run_state.verification_renders,
     )
+
+
+def _try_worst(verifier: Verifier, config: SweepConfig, u: Tensor) -> VerifiedRate:
+    """Make the trials of a configuration, and return its rate of wrong predictions.
+
+    Args:
+        verifier: verifier that has chosen the samples per pixel.
+        config: settings of the sweep, with the number and the seed of the trials.
+        u: (d,) the configuration.
+    """
     spp = verifier.run_state.spp
-    sample_count = verifier.run_state.sample_count
     trials = run_trials(
         verifier.evaluate_all, u, spp=spp, seed=config.seed, trials=config.trials
     )
     # For an attack, a wrong prediction is a success.
     wrong_trials = [trial for trial in trials if trial.success]
     counts = TrialCounts(len(wrong_trials), len(trials), spp)
-    verified_rate = make_rate(counts, trials, wrong_trials)
-    has_converged = sample_count is not None and sample_count.converged
+    return make_rate(counts, trials, wrong_trials)
+
+
+def _has_converged(verifier: Verifier) -> bool:
+    """Return whether more samples would not change the sign of the margin.
+
+    A sample count that the settings state always counts as converged.
+    """
     is_spp_set = len(verifier.spp_ladder) == 1
-    return WorstVerified(
-        **vars(verified_rate),
-        converged=is_spp_set or has_converged,
-        renders=verifier.run_state.verification_renders,
-    )
+    sample_count = verifier.run_state.sample_count
+    return is_spp_set or (sample_count is not None and sample_count.converged)

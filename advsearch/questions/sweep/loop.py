@@ -139,32 +139,34 @@ class Sweep:
         if run is not None:
             self._write_notes(run)
         self._scenes = SceneLoader(job)
-        if executor is None:
-            self._executor: Workers = InProcess(
-                make_worker_call(self._scenes.load_by_name)
-            )
-        else:
-            self._executor = executor
+        self._executor = self._make_in_process() if executor is None else executor
         # Problems are loaded by the name of the scene in each work item.
         self.journal = Journal(run, ParallelEvaluator(None, executor))
-        self._n_rendered = (
-            0  # images, also predicted ones, since this sweep was resumed
-        )
-        # Counts of the full sweep, also of what was done before it was resumed.
-        self._n_traced = 0  # images that were traced, also to prepare predictors
-        self._n_predicted = 0  # images that were predicted from traced ones
-        self._n_lost = 0  # rows that have no prediction, since their worker died
+        self._reset_counts()
+        self._reset_progress()
         # Summaries of the predictors of images, by worker and scene. There is one for
         # each size of images; None if nothing that they predict moves.
         self._transport: dict[tuple[str, int], list[LinearTransport | None]] = {}
-        self._has_non_finite = (
-            run is not None and run.store.read_note(NOT_FINITE) is not None
-        )
+        self._has_non_finite = _has_stored_non_finite(run)
+        self._surface: SurfaceMap | None = None
+        self._drives: list[DriveRates] | None = None
+
+    def _make_in_process(self) -> Workers:
+        """Return what evaluates batches in this process."""
+        return InProcess(make_worker_call(self._scenes.load_by_name))
+
+    def _reset_progress(self) -> None:
+        """Set what is counted for the progress since this sweep was resumed to 0."""
+        self._n_rendered = 0  # images, also predicted ones
         self._sweep_begin = 0.0
         self._last_report = 0.0
         self._n_unreported = 0
-        self._surface: SurfaceMap | None = None
-        self._drives: list[DriveRates] | None = None
+
+    def _reset_counts(self) -> None:
+        """Set the counts of the full sweep to 0, also of what was done before a stop."""
+        self._n_traced = 0  # images that were traced, also to prepare predictors
+        self._n_predicted = 0  # images that were predicted from traced ones
+        self._n_lost = 0  # rows that have no prediction, since their worker died
 
     def _write_notes(self, run: RunDirectory) -> None:
         """Store the parts of ranges and the independent units, which readers need."""
@@ -184,13 +186,7 @@ class Sweep:
             self.stages.progress.message(warning)
         try:
             with reraise_lost_interrupt():
-                missing = self._find_missing()
-                # If no row is missing, the last scene is loaded: verifying the worst
-                # row and describing the image formation need a scene.
-                first_row = missing[0].start if missing else self.n_rows - 1
-                # loaded here, so that its time counts for the stage "setup"
-                self._scenes.load_scene(self._find_scene(first_row))
-                self._evaluate_rows(missing, predictions)
+                self._evaluate_missing(predictions)
                 worst = self._find_worst(predictions, verify=True)
                 self._map_surface()
                 self._analyze_drives()
@@ -201,6 +197,16 @@ class Sweep:
             worst = self._find_worst(predictions, verify=False)
         self.stages.end()
         return self._finish(predictions, ending, worst)
+
+    def _evaluate_missing(self, predictions: Predictions) -> None:
+        """Evaluate the rows that are not stored yet, and add their predictions."""
+        missing = self._find_missing()
+        # If no row is missing, the last scene is loaded: verifying the worst row and
+        # describing the image formation need a scene.
+        first_row = missing[0].start if missing else self.n_rows - 1
+        # loaded here, so that its time counts for the stage "setup"
+        self._scenes.load_scene(self._find_scene(first_row))
+        self._evaluate_rows(missing, predictions)
 
     def _map_surface(self) -> None:
         """Map wrong predictions over the surface, if that was requested."""
@@ -245,30 +251,42 @@ class Sweep:
         self.stages.begin("sweep", title, self.n_rows, hint=self._make_progress_hint())
         self.stages.progress.advance(self.n_rows - sum(map(len, missing)))
         self._sweep_begin = time.monotonic()
-        for batch in self._executor.compute(self._make_batches(missing)):
+        batches = self._make_batches(missing)
+        for batch in self._executor.compute(batches):
             evaluated = _pair_evaluations(batch)
-            queries = [query for query, _ in evaluated]
-            self._save_images(evaluated)
-            # The index of a query is the number of its row.
-            stored_rows = self.journal.store(evaluated, id_is_number=True)
-            self._add_costs(stored_rows)
-            # Models of one size share an image, which counts for the first of them.
-            self._n_rendered += sum(
-                self.job.is_first_of_size[query.row_index % self.n_models]
-                for query in queries
-            )
-            scene = self._find_scene(queries[0].row_index)
-            # Summaries of predictors are in the last evaluation of a batch. A later
-            # batch of the same worker and scene replaces them.
-            _, last_evaluation = evaluated[-1]
-            self._transport[batch.worker, scene] = last_evaluation.collected_light or []
-            if any(evaluation.n_non_finite for _, evaluation in evaluated):
-                self._note_non_finite()
+            self._store_batch(evaluated, batch.worker)
             for query, evaluation in evaluated:
                 predictions.add(query.row_index, evaluation.required_judgement)
-            self._report(len(queries), predictions)
+            self._report(len(evaluated), predictions)
         # Workers may finish batches in any order.
         self.journal.rows.sort(key=lambda row: row.step)
+
+    def _store_batch(
+        self, evaluated: Sequence[tuple[Query, Evaluation]], worker: str
+    ) -> None:
+        """Store the evaluations of a batch, and count what they cost.
+
+        Args:
+            evaluated: queries of one scene with their evaluations.
+            worker: name of the worker that evaluated them.
+        """
+        self._save_images(evaluated)
+        # The index of a query is the number of its row.
+        stored_rows = self.journal.store(evaluated, id_is_number=True)
+        self._add_costs(stored_rows)
+        # Models of one size share an image, which counts for the first of them.
+        model_indices = [query.row_index % self.n_models for query, _ in evaluated]
+        self._n_rendered += sum(
+            self.job.is_first_of_size[model] for model in model_indices
+        )
+        first_query, _ = evaluated[0]
+        scene = self._find_scene(first_query.row_index)
+        # Summaries of predictors are in the last evaluation of a batch. A later batch of
+        # the same worker and scene replaces them.
+        _, last_evaluation = evaluated[-1]
+        self._transport[worker, scene] = last_evaluation.collected_light or []
+        if any(evaluation.n_non_finite for _, evaluation in evaluated):
+            self._note_non_finite()
 
     def _make_progress_hint(self) -> str:
         """Return the hint of the progress bar about the work ahead.
@@ -284,11 +302,7 @@ class Sweep:
         keep = self.job.config.keep_pictures
         if self.run is None or keep == "none":
             return hint
-        megabytes = self._estimate_thumbnail_megabytes()
-        if megabytes >= 1e3:
-            size = f"{megabytes / 1e3:.1f} GB"
-        else:
-            size = f"{max(megabytes, 0.1):.1f} MB"
+        size = _format_megabytes(self._estimate_thumbnail_megabytes())
         # Unless all are stored, only those of wrong predictions are.
         about = "about" if keep == "all" else "at most about"
         return f"{hint}; pictures that are kept take {about} {size}"
@@ -349,11 +363,10 @@ class Sweep:
         while image < images_end:
             scene_begin = image // self.images_per_scene * self.images_per_scene
             scene_end = scene_begin + self.images_per_scene
+            end = min(images_end, scene_end)
             # Batches begin at multiples of their size, counted from the scene's begin.
             batches = split_into_batches(
-                image - scene_begin,
-                min(images_end, scene_end) - scene_begin,
-                self.job.config.batch,
+                image - scene_begin, end - scene_begin, self.job.config.batch
             )
             for batch in batches:
                 yield range(scene_begin + batch.start, scene_begin + batch.stop)
@@ -370,6 +383,20 @@ class Sweep:
         now = time.monotonic()
         if now - self._last_report < REPORT_SECONDS:
             return
+        values = self._make_progress_values(predictions, now)
+        self.stages.progress.advance(self._n_unreported, **values)
+        self._last_report = now
+        self._n_unreported = 0
+
+    def _make_progress_values(
+        self, predictions: Predictions, now: float
+    ) -> dict[str, float | str]:
+        """Return the accuracy so far, and what the workers do; empty if unknown.
+
+        Args:
+            predictions: predictions so far.
+            now: seconds of the monotonic clock.
+        """
         values = dict[str, float | str]()
         n_counted = int(predictions.is_counted.sum())
         if n_counted:
@@ -380,16 +407,12 @@ class Sweep:
             seconds = max(1e-9, now - self._sweep_begin)  # no division by 0
             speed = self._n_rendered / seconds
             values |= {**worker_stats.progress_counts, "a second": speed}
-        self.stages.progress.advance(self._n_unreported, **values)
-        self._last_report = now
-        self._n_unreported = 0
+        return values
 
     def _read_predictions(self) -> Predictions:
         """Read the predictions of all rows so far, and count their costs anew."""
         predictions = Predictions(self.n_rows)
-        self._n_traced = 0
-        self._n_predicted = 0
-        self._n_lost = 0
+        self._reset_counts()
         for row in self.iterate_rows():
             predictions.add(row.step, read_judgement(row))
             self._add_costs([row])
@@ -436,20 +459,26 @@ class Sweep:
             *self._make_grid_axes(image_in_scene),
         ]
         if self._sampled_numbers and len(rows):
-            parts = self._find_parts(image)  # (n, k)
-            axes += [
-                TableAxis(
-                    name=number.name,
-                    unit=number.unit,
-                    values=number.range_parts,
-                    value_index=part_of_row,
-                    kind="drawn",
-                )
-                for number, part_of_row in zip(
-                    self._sampled_numbers, parts.T, strict=True
-                )
-            ]
+            axes += self._make_sampled_axes(image)
         return [axis for axis in axes if len(axis.values) > 1]
+
+    def _make_sampled_axes(self, image: npt.NDArray[np.int64]) -> list[TableAxis]:
+        """Return the axes of the sampled numbers.
+
+        Args:
+            image: (n,) number of the image of each row, in the sweep.
+        """
+        parts = self._find_parts(image)  # (n, k)
+        return [
+            TableAxis(
+                name=number.name,
+                unit=number.unit,
+                values=number.range_parts,
+                value_index=part_of_row,
+                kind="drawn",
+            )
+            for number, part_of_row in zip(self._sampled_numbers, parts.T, strict=True)
+        ]
 
     def _make_scene_axes(self, scene: npt.NDArray[np.int64]) -> Iterator[TableAxis]:
         """Yield the axes over scenes: object, environment, photograph, arm.
@@ -476,9 +505,8 @@ class Sweep:
             return []
         # The samples of a grid point are consecutive images.
         grid_point = image // self.job.samples_per_grid_point
-        indices = np.unravel_index(
-            grid_point, self.first_scene_configurations.grid.sizes
-        )
+        grid = self.first_scene_configurations.grid
+        indices = np.unravel_index(grid_point, grid.sizes)
         return [
             TableAxis(
                 name=axis.name,
@@ -500,16 +528,13 @@ class Sweep:
             images: (n,) their numbers in the sweep, ascending, at least one.
         """
         last_image = int(images[-1])
+        configurations = self.first_scene_configurations
         parts = list[npt.NDArray[np.int64]]()
         for scene_begin in range(0, last_image + 1, self.images_per_scene):
             scene_end = scene_begin + self.images_per_scene
             for batch in split_into_batches(scene_begin, scene_end, SAMPLING_BATCH):
                 if batch.start <= last_image:
-                    parts.append(
-                        self.first_scene_configurations.find_parts(
-                            batch.start, len(batch)
-                        )
-                    )
+                    parts.append(configurations.find_parts(batch.start, len(batch)))
         return np.asarray(np.concatenate(parts)[images])
 
     def _find_worst(
@@ -527,26 +552,29 @@ class Sweep:
         row_number = predictions.worst_row
         if row_number is None:
             return None
-        row = self._read_row(row_number)
-        image, model = divmod(row_number, self.n_models)
-        item_of_model = self.job.make_queries(range(image, image + 1))
-        _, _, query = item_of_model[model]  # an item ends with its query
+        model = row_number % self.n_models
+        claim = _make_claim(read_judgement(self._read_row(row_number)))
+        query = self._make_query_of_row(row_number)
         scene = self._find_scene(row_number)
         worst = WorstConfiguration(
             configuration=row_number,
-            values={
-                name: DescribedValue.from_values(value)
-                for name, value in query.values.items()
-            },
+            values=_describe_values(query),
             seed=query.seed,
             label_set=self._find_right_labels(scene, model, query),
-            claimed=_make_claim(read_judgement(row)),
+            claimed=claim,
             verified=None,
         )
         if not verify:
             return worst
         problem = self._scenes.load_scene(scene).problems[model]
         return self._verify_worst(worst, problem, query.u)
+
+    def _make_query_of_row(self, number: int) -> Query:
+        """Return the query that a row, by its number, stores the result of."""
+        image, model = divmod(number, self.n_models)
+        item_of_model = self.job.make_queries(range(image, image + 1))
+        _, _, query = item_of_model[model]  # an item ends with its query
+        return query
 
     def _read_row(self, number: int) -> Row:
         """Return a row that was evaluated, from the run directory if there is one."""
@@ -563,9 +591,9 @@ class Sweep:
             truth = problem.find_truth(query.u, query.values)
         else:
             # The facts of the scene are enough, so that it need not be loaded.
-            truth = task.truth(
-                self.job.make_ground_truth_facts(self.job.scenes[scene], query.values)
-            )
+            named_scene = self.job.scenes[scene]
+            facts = self.job.make_ground_truth_facts(named_scene, query.values)
+            truth = task.truth(facts)
         return list(task.truth_names(truth))
 
     def _verify_worst(
@@ -622,62 +650,65 @@ class Sweep:
             ending: how the sweep ended.
             worst: the configuration with the smallest margin; None without one.
         """
-        job = self.job
-        config = job.config
+        config = self.job.config
         path = None if self.run is None else self.run.path
         # the rate of wrong predictions in fresh renders
         verified = worst.verified if worst else None
-        formation, gains = self._describe_formation()
         changes = self._compute_change_rates()
+        remarks = self._list_remarks(predictions, verified, changes)
         return SweepSummary(
             **self._summarize_job(),
             **self._summarize_predictions(predictions),
+            **self._summarize_renders(verified),
             run=None if path is None else str(path),
             ending=ending,
-            image_formation=formation,
-            gains=gains if len(gains) > 1 else None,
             worst=worst,
-            renders=self._count_renders(verified),
-            transport=self._combine_transport(),
             surface=self._surface,
             drives=self._drives,
             changes=changes or None,
-            shared=SharedWork.from_worker_stats(
-                self._executor.stats, self.journal.machines
-            ),
-            renders_per_second=self._compute_speed(
-                self.stages.seconds.get("sweep", 0.0)
-            ),
             seconds={**self.stages.seconds, "total": self.stages.total_seconds},
-            warnings=[
-                *job.warnings,
-                *self._list_remarks(predictions, verified, changes),
-            ],
+            warnings=[*self.job.warnings, *remarks],
             command_line=config.command_line(path),
             python_only=config.python_only,
             twins=self._find_twins(),
         )
 
+    def _summarize_renders(self, verified: WorstVerified | None) -> dict[str, Any]:
+        """Return the fields of a summary about how images were made, and by whom.
+
+        Args:
+            verified: fresh renders of the worst configuration; None without them.
+        """
+        formation, gains = self._describe_formation()
+        sweep_seconds = self.stages.seconds.get("sweep", 0.0)
+        return {
+            "image_formation": formation,
+            "gains": gains if len(gains) > 1 else None,
+            "renders": self._count_renders(verified),
+            "transport": self._combine_transport(),
+            "shared": SharedWork.from_worker_stats(
+                self._executor.stats, self.journal.machines
+            ),
+            "renders_per_second": self._compute_speed(sweep_seconds),
+        }
+
     def _summarize_job(self) -> dict[str, Any]:
         """Return the fields of a summary about what was swept."""
         job = self.job
         config = job.config
+        is_sampled = self.first_scene_configurations.is_sampled
+        ranges = {number.name: number.varied_value for number in self._sampled_numbers}
         return {
             "object": config.object,
             "model": ",".join(_get_names(job.models)),
             "task": config.task_name,
             "environment": self._environment,
             "controls": _get_names(job.controls),
-            # the sampled numbers, with their ranges
-            "drawn": {
-                number.name: number.varied_value for number in self._sampled_numbers
-            },
+            "drawn": ranges,
             "planned": self.n_rows,
             "grid": {axis.name: len(axis.values) for axis in job.axes},
             "samples": job.samples_per_grid_point,
-            "sampler": config.sampler
-            if self.first_scene_configurations.is_sampled
-            else None,
+            "sampler": config.sampler if is_sampled else None,
             "spp": job.spp,
             "seed": config.seed,
         }
@@ -737,25 +768,31 @@ class Sweep:
         scenes, there are no gains, and the formation states none either. If no scene
         was loaded, the formation is None.
         """
-        gains: dict[str, float] = {}
         if self._scenes.loaded_scene is None:
-            return None, gains
+            return None, {}
         # Formations of other sizes differ only in the resolution.
         renderer = next(iter(self._scenes.loaded_scene.renderer_of_size.values()))
         formation = Formation.from_values(renderer.formation)
+        gains: dict[str, float] = {}
         if len(self.job.scenes) <= MAX_LISTED_GAINS:
-            for named_scene in self.job.scenes:
-                description = fit_camera(
-                    named_scene.scene.description, self.job.image_sizes[0]
-                )
-                names = dict(named_scene.value_of_scene_axis)
-                # The adversarial scene has the gain of its clean scene.
-                names.pop("answer", None)  # the name of the arm
-                gains[", ".join(names.values())] = description.gain
+            gains = self._list_scene_gains()
         have_same_gain = len(set(gains.values())) == 1  # False without gains
         if not have_same_gain:
             formation = formation.model_copy(update={"gain": None})
         return formation, gains
+
+    def _list_scene_gains(self) -> dict[str, float]:
+        """Return the gain of each scene, the factor of its exposure, by its names."""
+        gains: dict[str, float] = {}
+        for named_scene in self.job.scenes:
+            description = fit_camera(
+                named_scene.scene.description, self.job.image_sizes[0]
+            )
+            names = dict(named_scene.value_of_scene_axis)
+            # The adversarial scene has the gain of its clean scene.
+            names.pop("answer", None)  # the name of the arm
+            gains[", ".join(names.values())] = description.gain
+        return gains
 
     def _compare_arms(self, predictions: Predictions) -> ArmComparison | None:
         """Compare the clean scenes with the adversarial ones; None without any."""
@@ -832,16 +869,13 @@ class Sweep:
             claim: name of the claim, such as "must_change".
             change: name of the change of the image, such as "black".
         """
-        rows = np.array(
-            [row for row in value_of_row if row % self.n_models == model],
-            dtype=np.int64,
-        )
-        is_met = np.array(
-            [value_of_row[row] == 1.0 for row in rows.tolist()], dtype=bool
-        )
+        row_numbers = [row for row in value_of_row if row % self.n_models == model]
+        rows = np.array(row_numbers, dtype=np.int64)
+        is_met = np.array([value_of_row[row] == 1.0 for row in row_numbers], dtype=bool)
         violations = rows[~is_met]
+        units = self.independent_units.find_unit(rows)
         return ChangeRates(
-            **vars(count_predictions(is_met, self.independent_units.find_unit(rows))),
+            **vars(count_predictions(is_met, units)),
             model=self.job.models[model].name,
             claim=claim,
             when=change,
@@ -863,37 +897,25 @@ class Sweep:
         """
         yield from make_lost_remarks(self._n_lost)
         yield from self.journal.remarks
-        units = self.independent_units
-        n_repeats = units.noise  # images that differ only in noise
-        # With a folder of photographs, a unit is a photograph, and not such images.
-        if n_repeats > 1 and units.photographs == 1:
-            n_units = self.n_rows // units.size
-            yield explain_repeats(units.name, n_repeats, n_units)
+        yield from self._list_repeat_remarks()
         yield from self._list_drive_remarks()
         yield from self._list_prediction_remarks(predictions)
         if self._has_non_finite:
             yield "Some values of pictures were not finite and were set to 0."
         if verified and not verified.converged:
-            yield (
-                "It is not shown that the worst margin keeps its side beyond "
-                f"{verified.spp} samples a pixel, the most "
-                "that a check takes: noise may take part in it."
-            )
+            yield _make_noise_remark(verified.spp)
         for rates in changes:
-            # The upper bound of the fraction of predictions that meet the claim; 1 if
-            # no interval is known.
-            upper_bound = rates.interval[1] if rates.interval is not None else 1.0
-            # The claim is that predictions change if the object is hidden. If the 95 %
-            # interval lies below one half, most of them do not.
-            is_blind = rates.claim == "must_change" and upper_bound < 0.5
-            if is_blind:
-                # `correct` counts the predictions that changed.
-                n_same = rates.configurations - rates.correct
-                yield (
-                    f"{rates.model} says the same in {n_same} of "
-                    f"{rates.configurations} pictures when {BLIND[rates.when]}: it may "
-                    "not be looking at the object."
-                )
+            if _is_blind(rates):
+                yield _make_blind_remark(rates)
+
+    def _list_repeat_remarks(self) -> Iterator[str]:
+        """Yield a remark on images that differ only in noise."""
+        units = self.independent_units
+        n_repeats = units.noise
+        # With a folder of photographs, a unit is a photograph, and not such images.
+        if n_repeats > 1 and units.photographs == 1:
+            n_units = self.n_rows // units.size
+            yield explain_repeats(units.name, n_repeats, n_units)
 
     def _list_drive_remarks(self) -> Iterator[str]:
         """Yield a remark on what few drives can show at best.
@@ -919,26 +941,73 @@ class Sweep:
 
     def _list_prediction_remarks(self, predictions: Predictions) -> Iterator[str]:
         """Yield remarks on predictions that do not count, or do not count as right."""
-        n_hidden = int(predictions.is_out_of_view.sum())
-        if n_hidden:
-            # With several models, an image counts once for each.
-            images = format_count(int(predictions.has_prediction.sum()), "picture")
-            # predictions that find an object of which nothing is in the image
-            n_phantoms = predictions.n_phantoms_out_of_view
-            phantoms = ""
-            if n_phantoms:
-                phantoms = (
-                    f" In {n_phantoms} of them the model finds the object all the same."
-                )
-            yield (
-                f"In {n_hidden} of {images} nothing of the object is to be seen: they "
-                f"are not counted.{phantoms}"
-            )
+        if predictions.is_out_of_view.any():
+            yield _make_hidden_remark(predictions)
         if predictions.n_non_finite:
             yield (
                 f"{predictions.n_non_finite} predictions of the model are not "
                 "numbers; they count as not right."
             )
+
+
+def _make_noise_remark(spp: int) -> str:
+    """Return that noise may decide the worst margin, with the samples that were tried."""
+    return (
+        "It is not shown that the worst margin keeps its side beyond "
+        f"{spp} samples a pixel, the most "
+        "that a check takes: noise may take part in it."
+    )
+
+
+def _make_hidden_remark(predictions: Predictions) -> str:
+    """Return a remark on images without the object, which are not counted."""
+    n_hidden = int(predictions.is_out_of_view.sum())
+    # With several models, an image counts once for each.
+    images = format_count(int(predictions.has_prediction.sum()), "picture")
+    # predictions that find an object of which nothing is in the image
+    n_phantoms = predictions.n_phantoms_out_of_view
+    phantoms = ""
+    if n_phantoms:
+        phantoms = f" In {n_phantoms} of them the model finds the object all the same."
+    return (
+        f"In {n_hidden} of {images} nothing of the object is to be seen: they "
+        f"are not counted.{phantoms}"
+    )
+
+
+def _is_blind(rates: ChangeRates) -> bool:
+    """Return whether most predictions stay the same if the object is hidden.
+
+    The claim is that they change. If the 95 % interval of the fraction that does lies
+    below one half, most of them do not.
+    """
+    # The upper bound of the fraction of predictions that meet the claim; 1 if no
+    # interval is known.
+    upper_bound = rates.interval[1] if rates.interval is not None else 1.0
+    return rates.claim == "must_change" and upper_bound < 0.5
+
+
+def _make_blind_remark(rates: ChangeRates) -> str:
+    """Return that most predictions of a model stay the same without the object."""
+    # `correct` counts the predictions that changed.
+    n_same = rates.configurations - rates.correct
+    return (
+        f"{rates.model} says the same in {n_same} of "
+        f"{rates.configurations} pictures when {BLIND[rates.when]}: it may "
+        "not be looking at the object."
+    )
+
+
+def _format_megabytes(megabytes: float) -> str:
+    """Return a size as text, in gigabytes if it is large; at least 0.1 MB."""
+    if megabytes >= 1e3:
+        return f"{megabytes / 1e3:.1f} GB"
+    return f"{max(megabytes, 0.1):.1f} MB"
+
+
+def _has_stored_non_finite(run: RunDirectory | None) -> bool:
+    """Return whether a run has the note that some values of images were not finite."""
+    return run is not None and run.store.read_note(NOT_FINITE) is not None
 
 
 def _get_names(items: Iterable[Any]) -> list[str]:
@@ -988,3 +1057,10 @@ def _make_claim(judgement: Judgement) -> WorstClaim:
         margin=judgement.margin,
         payload=judgement.payload,
     )
+
+
+def _describe_values(query: Query) -> dict[str, DescribedValue]:
+    """Return the values of a query by parameter, as a result states them."""
+    return {
+        name: DescribedValue.from_values(value) for name, value in query.values.items()
+    }

@@ -29,6 +29,7 @@ from advsearch.report.views import Html, join_html, make_element
 from advsearch.report.views import get_view as make_view
 from advsearch.report.wording import format_paired_rates, format_prediction
 from advsearch.runs import directory
+from advsearch.runs.results import VerifiedRate
 from advsearch.runs.summary import read_result
 from advsearch.settings import read_yaml
 from advsearch.trust.writing import (
@@ -145,28 +146,41 @@ def make_sweep_page(
         if source.rows is not None
     ]
     descriptions, embedded_rows, image_notes = _describe_runs(explored)
+    explorer = make_element("div", id="explorer", hidden="hidden")
+    if not explored:
+        explorer = _too_many_rows_html(runs)
+    title = ", ".join(path.name for path, _ in runs)
+    return make_document(
+        title,
+        _header_html(runs),
+        make_element("main", explorer, *image_notes, *_list_contents(runs)),
+        data=[make_data_script(descriptions, "runs"), *embedded_rows],
+        scripts=["sweep.js"],
+        connects=_needs_connection(sources),
+    )
 
-    stills = list[Html]()
+
+def _list_contents(
+    runs: Sequence[tuple[Path, SweepSummary | None]],
+) -> list[Html | None]:
+    """Return the still images of all runs, and then their parts."""
+    stills = list[Html | None]()
     parts = list[Html | None]()
     for path, summary in runs:
         if summary is not None:
             stills.append(_still_html(path, summary))
             parts += _page_parts_html(path, summary)
-    explorer = make_element("div", id="explorer", hidden="hidden")
-    if not explored:
-        explorer = _too_many_rows_html(runs)
-    # The page's script fetches rows or images from an address. The security policy of
-    # the page has to allow that.
-    needs_connection = any(
-        isinstance(source.rows, str) or source.thumbnail_address for source in sources
-    )
-    return make_document(
-        ", ".join(path.name for path, _ in runs),
-        _header_html(runs),
-        make_element("main", explorer, *image_notes, *stills, *parts),
-        data=[make_data_script(descriptions, "runs"), *embedded_rows],
-        scripts=["sweep.js"],
-        connects=needs_connection,
+    return [*stills, *parts]
+
+
+def _needs_connection(sources: Sequence[SweepSource]) -> bool:
+    """Return whether the script of a page fetches rows or images from an address.
+
+    The security policy of the page has to allow that.
+    """
+    return any(
+        isinstance(source.rows, str) or bool(source.thumbnail_address)
+        for source in sources
     )
 
 
@@ -236,14 +250,18 @@ def _describe_images(
         thumbnails.list_data_urls(source.rows, MAX_EMBEDDED_BYTES)
     )
     images["embedded"] = embedded
-    n_thumbnails = len(thumbnails.numbers)
-    if len(embedded) == n_thumbnails:
-        return images, None
+    return images, _note_embedded(len(embedded), len(thumbnails.numbers))
+
+
+def _note_embedded(n_embedded: int, n_thumbnails: int) -> Html | None:
+    """Return a note that a page has only some of the thumbnails; None if it has all."""
+    if n_embedded == n_thumbnails:
+        return None
     note = (
-        f"This file has {len(embedded):,} of the {n_thumbnails:,} pictures that were "
+        f"This file has {n_embedded:,} of the {n_thumbnails:,} pictures that were "
         "kept, those of the worst margins."
     )
-    return images, make_element("p", note, class_="soft")
+    return make_element("p", note, class_="soft")
 
 
 def _page_parts_html(path: Path, summary: SweepSummary) -> list[Html | None]:
@@ -273,23 +291,29 @@ def _describe_for_explorer(run: Path, summary: SweepSummary | None) -> JsonObjec
         summary: summary of the sweep; None without one.
     """
     if summary is None:
-        with suppress(AdvsearchError):
-            task = read_yaml(run / directory.CONFIG).get("task")
-            name = task.get("name") if isinstance(task, Mapping) else task
-            # a text may have options, as in "detection=..."
-            return {"task": str(name).partition("=")[0]}
-        return {}  # reading the settings failed
+        return _read_task(run)
     formation = summary.image_formation
     size = None
     has_single_model = "," not in summary.model
     if formation is not None and has_single_model:
         size = list[JsonValue](formation.resolution)
+    axis_names = dict.fromkeys(row.axis for row in summary.axes)
     return {
         "task": summary.task,
         "size": size,
-        "grid": list[JsonValue](dict.fromkeys(row.axis for row in summary.axes)),
+        "grid": list[JsonValue](axis_names),
         "drives": bool(summary.drives),
     }
+
+
+def _read_task(run: Path) -> JsonObject:
+    """Return the task in the settings of a run; empty if these cannot be read."""
+    with suppress(AdvsearchError):
+        task = read_yaml(run / directory.CONFIG).get("task")
+        name = task.get("name") if isinstance(task, Mapping) else task
+        # a text may have options, as in "detection=..."
+        return {"task": str(name).partition("=")[0]}
+    return {}
 
 
 def _header_html(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
@@ -298,31 +322,40 @@ def _header_html(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
     heading = "h1" if len(runs) == 1 else "h2"
     for path, summary in runs:
         if summary is None:
-            lines += [
-                make_element(heading, f"{path.name}: this sweep has not ended yet")
-            ]
-            continue
-        subject = make_subject_html(
-            ("object", summary.object),
-            ("environment", summary.environment),
-            ("model", summary.model),
-        )
-        lines += [
-            make_element("p", f"sweep {path.name}; ", subject, class_="eyebrow"),
-            make_element(heading, verdict_text(summary)),
-            remarks_html(summary.warnings),
-        ]
+            text = f"{path.name}: this sweep has not ended yet"
+            lines.append(make_element(heading, text))
+        else:
+            lines += _list_header_lines(path, summary, heading)
     title = make_element("h1", "Sweeps side by side") if len(runs) > 1 else None
     return make_element("header", title, *lines)
+
+
+def _list_header_lines(path: Path, summary: SweepSummary, heading: str) -> list[Html]:
+    """Return the subject, the result and the warnings of a sweep for the header.
+
+    Args:
+        path: the run directory.
+        summary: summary of the sweep.
+        heading: the HTML tag of the result, "h1" or "h2".
+    """
+    subject = make_subject_html(
+        ("object", summary.object),
+        ("environment", summary.environment),
+        ("model", summary.model),
+    )
+    return [
+        make_element("p", f"sweep {path.name}; ", subject, class_="eyebrow"),
+        make_element(heading, verdict_text(summary)),
+        remarks_html(summary.warnings),
+    ]
 
 
 def _too_many_rows_html(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
     """Return a note in place of the explorer, for a page with too many rows."""
     names = [directory.format_run_name(path) for path, _ in runs]
     command = shlex.join(["advsearch", "dashboard", *names])
-    counts = ", ".join(
-        f"{summary.configurations:,}" for _, summary in runs if summary is not None
-    )
+    summaries = [summary for _, summary in runs if summary is not None]
+    counts = ", ".join(f"{summary.configurations:,}" for summary in summaries)
     return make_element(
         "p",
         f"This file leaves out the {counts} rows, and what pictures they have: it "
@@ -344,10 +377,8 @@ def verdict_text(summary: SweepSummary) -> str:
             return "The object is in no picture."
         return "No configuration was looked at."
     if summary.arms and summary.arms.pairs:
-        return " ".join(
-            format_paired_rates(summary.arms.adversarial_run, pair)
-            for pair in summary.arms.pairs
-        )
+        run = summary.arms.adversarial_run
+        return " ".join(format_paired_rates(run, pair) for pair in summary.arms.pairs)
     so_far = ""
     if summary.looked_at != summary.planned:
         so_far = f" so far, of {summary.planned} planned"
@@ -368,25 +399,30 @@ def _still_html(path: Path, summary: SweepSummary) -> Html:
         path: the run directory.
         summary: summary of the sweep.
     """
-    measure = "Accuracy"
-    if summary.cells:
-        max_configurations = max(map(max, summary.cells.configurations))
-        if max_configurations <= 1:  # as `display._draw_map` decides
-            measure = "Margin"
     # The figure shows the first two axes.
     axis_names = list(dict.fromkeys(row.axis for row in summary.axes))
     axes = " and ".join(axis_names[:2]) or "all configurations"
-    figure = _figure_html(path / "images" / "sweep.png", f"{measure} over {axes}.")
+    caption = f"{_find_measure(summary)} over {axes}."
+    figure = _figure_html(path / "images" / "sweep.png", caption)
     worst = _figure_html(path / "images" / "worst.png", _worst_caption(summary))
-    return join_html(
+    parts = list[Html | None]()
+    if figure:
         # The page's script hides this element once the explorer replaces it. The worst
         # image stays.
-        make_element("div", figure, class_="pictures", data_still="true")
-        if figure
-        else None,
-        make_element("h2", "The worst configuration") if worst else None,
-        make_element("div", worst, class_="pictures pair") if worst else None,
-    )
+        parts.append(make_element("div", figure, class_="pictures", data_still="true"))
+    if worst:
+        parts.append(make_element("h2", "The worst configuration"))
+        parts.append(make_element("div", worst, class_="pictures pair"))
+    return join_html(*parts)
+
+
+def _find_measure(summary: SweepSummary) -> str:
+    """Return what the figure of a sweep shows, as `display._draw_map` decides."""
+    if summary.cells:
+        max_configurations = max(map(max, summary.cells.configurations))
+        if max_configurations <= 1:
+            return "Margin"
+    return "Accuracy"
 
 
 def _worst_caption(summary: SweepSummary) -> str:
@@ -400,14 +436,19 @@ def _worst_caption(summary: SweepSummary) -> str:
     )
     # the prediction about the saved image, or else the one of the sweep
     claim = worst.pictured or worst.claimed
-    text = f"{values}: the model predicts {format_prediction(summary.task, claim)}"
-    rate = worst.verified
-    if rate is not None:
-        wrong = wording.format_tally(
-            "wrong", rate.successes, rate.trials, rate.not_a_number
-        )
-        text += f"; {wrong} fresh renders"
-    return f"{text}."
+    prediction = format_prediction(summary.task, claim)
+    verified = _verified_clause(worst.verified)
+    return f"{values}: the model predicts {prediction}{verified}."
+
+
+def _verified_clause(rate: VerifiedRate | None) -> str:
+    """Return in how many fresh renders the model is wrong; empty without any."""
+    if rate is None:
+        return ""
+    wrong = wording.format_tally(
+        "wrong", rate.successes, rate.trials, rate.not_a_number
+    )
+    return f"; {wrong} fresh renders"
 
 
 def _figure_html(file: Path, caption: str) -> Html | None:
@@ -511,12 +552,17 @@ def _write_source(run: Path, index: int, folder: Path) -> SweepSource:
         write_bytes(folder / rows, pack_columns(columns))
     image_folder = f"pictures-{index}"
     thumbnails = find_thumbnails(run)
-    numbers = thumbnails.numbers if thumbnails else ()
-    for number in numbers:
-        # Only the numbered subfolder and the name are those of a run.
-        file = thumbnail_path(folder / image_folder, number)
-        target = folder / image_folder / file.parent.name / file.name
-        write_bytes(target, read_thumbnail(run, number))
+    if thumbnails:
+        _copy_thumbnails(run, thumbnails, folder / image_folder)
     return SweepSource(
         run.name, rows, thumbnails=thumbnails, thumbnail_address=image_folder
     )
+
+
+def _copy_thumbnails(run: Path, thumbnails: Thumbnails, folder: Path) -> None:
+    """Copy the thumbnails of a run into a folder of a bundle."""
+    for number in thumbnails.numbers:
+        # Only the numbered subfolder and the name are those of a run.
+        file = thumbnail_path(folder, number)
+        target = folder / file.parent.name / file.name
+        write_bytes(target, read_thumbnail(run, number))

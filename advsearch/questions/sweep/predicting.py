@@ -14,6 +14,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -71,6 +72,9 @@ prediction, including the comparisons.
 """
 
 
+BASIS_PIXEL_BYTES = 8  # approximate memory of a pixel of a basis image
+
+
 class Groups:
     """Divides the images of a scene into groups, each of which one predictor serves.
 
@@ -108,13 +112,13 @@ class Groups:
         self.samples = samples
         # Samples are like one more axis, the last and fastest.
         self._all_axes = ProductIndex((*grid.sizes, samples))
-        is_within = []  # for each axis
-        for axis, may_differ in enumerate(within):
-            # Two images along any axis but that of the frames have different draws.
-            shares_draw = axis == frame_axis
-            is_within.append(may_differ and (may_draws_differ or shares_draw))
-        is_within.append(may_draws_differ)  # the axis of the samples
-        self._is_within = tuple(is_within)
+        # Two images along any axis but that of the frames have different draws.
+        is_within = [
+            may_differ and (may_draws_differ or axis == frame_axis)
+            for axis, may_differ in enumerate(within)
+        ]
+        # The samples, whose axis is the last, have different draws, too.
+        self._is_within = (*is_within, may_draws_differ)
         within_sizes = self._select(self._all_axes.sizes, is_within=True)
         between_sizes = self._select(self._all_axes.sizes, is_within=False)
         self._within = ProductIndex(tuple(within_sizes))
@@ -217,15 +221,12 @@ class BasisPictures:
             make_groups: returns the groups whose images differ in some parameters.
             spp: samples per pixel of the images.
         """
-        renderer = self._renderer
         groups = make_groups(self.parameters)
         # Only an image without noise can be predicted from basis images.
-        is_denoised = renderer.formation.denoiser == "oidn"
+        is_denoised = self._renderer.formation.denoiser == "oidn"
         if not is_denoised:
             return NOISE
-        # The number of lights is the same in all configurations: take the first one.
-        inputs = renderer.scene.input_assembler(renderer.space.inputs(renderer.start))
-        n_lights = len(LightBasis(renderer, self._lighting, inputs).inputs_of_light)
+        n_lights = self._count_lights()
         prediction_samples = n_lights * COLLECTED_SPP + _count_check_samples(spp)
         # Rendering a group takes `spp` for each image.
         min_images = math.ceil(MIN_SAVING_FACTOR * prediction_samples / spp)
@@ -234,9 +235,20 @@ class BasisPictures:
                 f"basis pictures pay where {min_images} pictures or more differ in "
                 f"light alone; here {groups.group_size} do"
             )
-        height, width = renderer.formation.resolution
-        # about 8 bytes for each pixel of a basis image
-        n_bytes = groups.n_groups_to_cache * n_lights * 8 * height * width
+        return self._find_memory_refusal(groups, n_lights)
+
+    def _count_lights(self) -> int:
+        """Count the lights, whose number is the same in all configurations."""
+        renderer = self._renderer
+        start_inputs = renderer.space.inputs(renderer.start)
+        inputs = renderer.scene.input_assembler(start_inputs)
+        return len(LightBasis(renderer, self._lighting, inputs).inputs_of_light)
+
+    def _find_memory_refusal(self, groups: Groups, n_lights: int) -> Refusal | None:
+        """Return a refusal if the basis images take too much memory; else None."""
+        height, width = self._renderer.formation.resolution
+        bytes_per_basis_image = BASIS_PIXEL_BYTES * height * width
+        n_bytes = groups.n_groups_to_cache * n_lights * bytes_per_basis_image
         if n_bytes > scale_limit(MAX_BYTES):
             return Refusal(
                 f"basis pictures of {groups.n_groups} groups take too much memory; "
@@ -362,10 +374,8 @@ class LightOnSurfaces:
         light_groups = make_groups(self.parameters)
         # The images of one of these groups have the same arrangement: neither object
         # nor surroundings move, and the object has one color.
-        same_arrangement_inputs = FREE_INPUTS - {COLOR_INPUT}
-        arrangement_groups = make_groups(
-            self._find_parameters_changing_only(same_arrangement_inputs)
-        )
+        parameters = self._find_parameters_changing_only(FREE_INPUTS - {COLOR_INPUT})
+        arrangement_groups = make_groups(parameters)
         self._max_arrangements = arrangement_groups.n_groups_to_cache
         # below 1 if several lights share an arrangement
         arrangements_per_light = arrangement_groups.n_groups / light_groups.n_groups
@@ -378,6 +388,17 @@ class LightOnSurfaces:
         refusal = find_scene_refusal(self._renderer)
         if refusal is not None:
             return refusal
+        return self._find_light_memory_refusal(arrangement_groups, light_groups)
+
+    def _find_light_memory_refusal(
+        self, arrangement_groups: Groups, light_groups: Groups
+    ) -> Refusal | None:
+        """Return a refusal if arrangements and light take too much memory; else None.
+
+        Args:
+            arrangement_groups: groups whose images have the same arrangement.
+            light_groups: groups whose images have the same light.
+        """
         environment = self._renderer.scene.get_base_value(ENVIRONMENT_INPUT)
         light_bytes = LIGHT_BYTES + 4 * environment.numel()  # 4 bytes for a float32
         n_bytes = (
@@ -404,9 +425,8 @@ class LightOnSurfaces:
             seed: not used; all arrangements have the same rays.
         """
         with torch.no_grad():
-            inputs = self._renderer.scene.input_assembler(
-                self._renderer.space.inputs(u)
-            )
+            space_inputs = self._renderer.space.inputs(u)
+            inputs = self._renderer.scene.input_assembler(space_inputs)
             for arrangement in self._arrangements:
                 if arrangement.is_applicable(inputs):
                     return arrangement.with_fixed_light(inputs)
@@ -517,17 +537,13 @@ class SweepPredictor:
         """
         axis_names = [axis.name for axis in self.axes]
         # Here a group is the coordinates of one parameter.
-        sampled_names = [
-            group.name
-            for group in self.renderer.space.groups
-            if group.name not in axis_names
-        ]
-        may_draws_differ = parameters.issuperset(sampled_names)
+        parameter_names = [group.name for group in self.renderer.space.groups]
+        sampled_names = [name for name in parameter_names if name not in axis_names]
         return Groups(
             self.configurations.grid,
             samples=self.configurations.samples_per_grid_point,
             within=tuple(name in parameters for name in axis_names),
-            may_draws_differ=may_draws_differ,
+            may_draws_differ=parameters.issuperset(sampled_names),
             frame_axis=self.configurations.independent_units.frames,
         )
 
@@ -546,29 +562,48 @@ class SweepPredictor:
         images: dict[int, SweptImage] = {}
         numbers_by_predictor: dict[Predictor, list[int]] = {}
         for number, query in query_of_image.items():
-            predictor = None  # the image is rendered
-            if self.refusal is None:
-                group = self._groups.find_group_of_image(number)
-                predictor = self._load_predictor(group, number)
+            predictor = self._find_predictor_of_image(number)
             if predictor is None:
-                image = self.renderer(
-                    query.u, seed=query.seed, spp=self.problem.search_spp
-                )
-                # Images may have been traced for a predictor that was then rejected.
-                n_traced = self._count_traced(number) + 1
-                images[number] = SweptImage(image, prediction_spp=0, n_traced=n_traced)
+                images[number] = self._render_swept_image(number, query)
             else:
                 numbers_by_predictor.setdefault(predictor, []).append(number)
         for predictor, numbers in numbers_by_predictor.items():
-            predicted = predictor.predict_images(
-                [query_of_image[number].u for number in numbers]
-            )
-            for number, image in zip(numbers, predicted, strict=True):
-                n_traced = self._count_traced(number)
-                images[number] = SweptImage(
-                    image, prediction_spp=self.method.samples, n_traced=n_traced
-                )
+            queries = [query_of_image[number] for number in numbers]
+            images |= self._predict_swept_images(predictor, numbers, queries)
         return images
+
+    def _find_predictor_of_image(self, number: int) -> Predictor | None:
+        """Return the predictor of an image of the scene; None if it is rendered."""
+        if self.refusal is not None:
+            return None
+        group = self._groups.find_group_of_image(number)
+        return self._load_predictor(group, number)
+
+    def _predict_swept_images(
+        self, predictor: Predictor, numbers: Sequence[int], queries: Sequence[Query]
+    ) -> dict[int, SweptImage]:
+        """Predict images by one predictor, by their numbers in the scene.
+
+        Args:
+            predictor: the predictor.
+            numbers: (n,) numbers of the images.
+            queries: (n,) their queries.
+        """
+        predicted = predictor.predict_images([query.u for query in queries])
+        images: dict[int, SweptImage] = {}
+        for number, image in zip(numbers, predicted, strict=True):
+            n_traced = self._count_traced(number)
+            images[number] = SweptImage(
+                image, prediction_spp=self.method.samples, n_traced=n_traced
+            )
+        return images
+
+    def _render_swept_image(self, number: int, query: Query) -> SweptImage:
+        """Render an image by its number in the scene."""
+        image = self.renderer(query.u, seed=query.seed, spp=self.problem.search_spp)
+        # Images may have been traced for a predictor that was then rejected.
+        n_traced = self._count_traced(number) + 1
+        return SweptImage(image, prediction_spp=0, n_traced=n_traced)
 
     def _count_traced(self, number: int) -> int:
         """Return how many images were traced to prepare the predictor of an image.
@@ -584,11 +619,8 @@ class SweepPredictor:
     def _load_predictor(self, group: int, number: int) -> Predictor | None:
         """Return the predictor of a group; None if its images are rendered.
 
-        A new predictor is compared with traced images first. If it deviates too much,
-        the images of its group are rendered. A predictor depends only on the index of
-        its group, not on the image that needs it first, so that a sweep that was
-        stopped continues with the same predictors. If too many are cached, the one that
-        was made first is released.
+        A predictor is cached. If too many are cached, the one that was made first is
+        released.
 
         Args:
             group: index of the group.
@@ -600,25 +632,38 @@ class SweepPredictor:
             oldest = next(iter(self._predictors))
             self._predictors.pop(oldest)
         begin = time.perf_counter()
+        self._predictors[group] = self._make_accurate_predictor(group, number)
+        self.seconds += time.perf_counter() - begin
+        return self._predictors[group]
+
+    def _make_accurate_predictor(self, group: int, number: int) -> Predictor | None:
+        """Make the predictor of a group, and compare it with traced images.
+
+        It depends only on the index of its group, not on the image that needs it first,
+        so that a sweep that was stopped continues with the same predictors.
+
+        Args:
+            group: index of the group.
+            number: number of an image of the group, in the scene.
+
+        Returns:
+            The predictor; None if it deviates too much. Then the images of its group
+            are rendered.
+        """
         # A scene has no more groups than images. So no two groups of the sweep have
         # the same index.
         group_index = self.images_before + group
         seed = seeds.derive_seed(self.seed, "light", group_index)
-        # The configuration is that of the first image of the group, whichever image
-        # comes first.
-        predictor = self.method.make_predictor(
-            self._make_configuration(number, 0), seed
-        )
+        # that of the first image of the group, whichever image comes first
+        configuration = self._make_configuration(number, index=0)
+        predictor = self.method.make_predictor(configuration, seed)
         deviation = self._compare(predictor, number, seed)
         self.deviations.append(deviation)
         self._n_traced_of_group[group] = predictor.n_traced_images + deviation.n_traced
         if deviation.is_accepted:
-            self._predictors[group] = predictor
-        else:
-            self._predictors[group] = None
-            self.rendered_groups.add(group)
-        self.seconds += time.perf_counter() - begin
-        return self._predictors[group]
+            return predictor
+        self.rendered_groups.add(group)
+        return None
 
     def _compare(self, predictor: Predictor, number: int, seed: int) -> Deviation:
         """Compare predicted images of a group with traced ones.
@@ -631,36 +676,38 @@ class SweepPredictor:
             number: number of an image of the group, in the scene.
             seed: seed of the comparison.
         """
-
-        def compute_margin(image: Tensor, u: Tensor) -> float:
-            """Return the margin of the model's prediction about an image.
-
-            The model gets images in 8 bits; other deviations are computed without
-            rounding.
-            """
-            return self.problem.judge(round_to_8_bit(image), u).margin
-
-        def compare_view(check: int) -> ComparedView:
-            """Compare a random image of the group with a traced one.
-
-            Args:
-                check: index of the comparison, for the seeds.
-            """
-            index = seeds.derive_seed(seed, "check", check) % self._groups.group_size
-            u = self._make_configuration(number, index)
-            (predicted,) = predictor.predict_images([u])
-            noise_seed = seeds.derive_seed(seed, "traced", check)
-            return compare_with_traced(
-                self.renderer,
-                predicted,
-                u,
-                noise_seed,
-                self.problem.search_spp,
-                compute_margin,
-            )
-
+        compare_view = partial(self._compare_view, predictor, number, seed)
         with torch.no_grad():
             return compare_views(compare_view)  # calls it once for each view
+
+    def _compare_view(
+        self, predictor: Predictor, number: int, seed: int, check: int
+    ) -> ComparedView:
+        """Compare a random image of a group with a traced one.
+
+        See `_compare` for the other arguments.
+
+        Args:
+            check: index of the comparison, for the seeds.
+        """
+        index = seeds.derive_seed(seed, "check", check) % self._groups.group_size
+        u = self._make_configuration(number, index)
+        (predicted,) = predictor.predict_images([u])
+        return compare_with_traced(
+            self.renderer,
+            predicted,
+            u,
+            seeds.derive_seed(seed, "traced", check),
+            self.problem.search_spp,
+            self._compute_margin_in_8_bits,
+        )
+
+    def _compute_margin_in_8_bits(self, image: Tensor, u: Tensor) -> float:
+        """Return the margin of the model's prediction about an image.
+
+        The model gets images in 8 bits; other deviations are computed without rounding.
+        """
+        return self.problem.judge(round_to_8_bit(image), u).margin
 
     def _make_configuration(self, number: int, index: int) -> Tensor:
         """Return the configuration (d,) of an image of a group.
@@ -691,31 +738,40 @@ class SweepPredictor:
             return None
         if self.refusal is not None:
             return LinearTransport(used=False, reason=str(self.refusal))
-        error = None
-        if self.deviations:
-            worst = max(self.deviations, key=lambda deviation: deviation.levels)
-            error = PredictionError.from_values(worst)
-        reason = None
-        if self.rendered_groups:
-            reason = (
-                f"{len(self.rendered_groups)} of {self._groups.n_groups} groups were "
-                "rendered: predicted pictures were too far off"
-            )
-        predictor_bytes = sum(
-            predictor.n_bytes
-            for predictor in self._predictors.values()
-            if predictor is not None
-        )
         # `entries` and `renewed` are about the matrix of an attack. Sweeps have none.
         return LinearTransport(
             used=True,
             method=self.method.name,
-            reason=reason,
+            reason=self._explain_rendered_groups(),
             entries=0,
-            bytes=self.method.bytes + predictor_bytes,
+            bytes=self.method.bytes + self._count_predictor_bytes(),
             seconds=self.seconds,
             renewed=0,
-            error=error,
+            error=self._find_worst_error(),
+        )
+
+    def _explain_rendered_groups(self) -> str | None:
+        """Return why some groups were rendered; None if none was."""
+        if not self.rendered_groups:
+            return None
+        return (
+            f"{len(self.rendered_groups)} of {self._groups.n_groups} groups were "
+            "rendered: predicted pictures were too far off"
+        )
+
+    def _find_worst_error(self) -> PredictionError | None:
+        """Return the largest deviation from traced images; None if none was compared."""
+        if not self.deviations:
+            return None
+        worst = max(self.deviations, key=lambda deviation: deviation.levels)
+        return PredictionError.from_values(worst)
+
+    def _count_predictor_bytes(self) -> int:
+        """Count the memory of the cached predictors."""
+        return sum(
+            predictor.n_bytes
+            for predictor in self._predictors.values()
+            if predictor is not None
         )
 
 
@@ -738,13 +794,14 @@ def combine_transport(
         return summaries[-1] if summaries else None
     reasons = [summary.reason for summary in with_predictions if summary.reason]
     errors = [summary.error for summary in with_predictions if summary.error]
-    # `levels` is how far an image was off, in levels of 8 bits.
-    worst_error = max(errors, key=lambda error: error.levels or 0.0, default=None)
+    all_bytes = [summary.bytes or 0 for summary in with_predictions]
+    all_seconds = [summary.seconds or 0.0 for summary in with_predictions]
     update = {
         "reason": reasons[0] if reasons else None,  # as an example for all
-        "bytes": max(summary.bytes or 0 for summary in with_predictions),
-        "seconds": math.fsum(summary.seconds or 0.0 for summary in with_predictions),
-        "error": worst_error,
+        "bytes": max(all_bytes),
+        "seconds": math.fsum(all_seconds),
+        # `levels` is how far an image was off, in levels of 8 bits.
+        "error": max(errors, key=lambda error: error.levels or 0.0, default=None),
     }
     # The other fields, such as the method, are the same in all scenes.
     return with_predictions[0].model_copy(update=update)
@@ -767,6 +824,31 @@ def prepare_surface_light(
         n_images: about how many trials there are.
     """
     problem = verifier.problem
+    if not _can_light_follow(problem, coordinates):
+        return
+    state = verifier.run_state
+    refusal = _find_light_refusal(problem.renderer, state.spp, n_images)
+    state.predictor_refusal = refusal
+    if refusal is not None:
+        return
+    title = "finding the light on surfaces"
+    hint = "`specialise=false` leaves it out"
+    verifier.progress_stages.begin("transport", title, N_LIGHTS, hint=hint)
+    light = SurfaceLight(problem, 0, light_u=at, moving_coordinates=coordinates)
+    # `prepare` compares predicted images with traced ones, and may refuse.
+    light.prepare(verifier.progress_stages.progress.advance)
+    state.predictor_refusal = light.accuracy_refusal
+    is_accurate = light.accuracy_refusal is None
+    state.predictor = light if is_accurate else None
+
+
+def _can_light_follow(problem: Problem, coordinates: Tensor) -> bool:
+    """Return whether the camera moves, and light on surfaces can follow what varies.
+
+    Args:
+        problem: problem of the trials.
+        coordinates: (k,) indices of the coordinates that vary.
+    """
     varying = set(coordinates.tolist())
     # the parameters that have any of these coordinates
     parameter_names = [
@@ -778,23 +860,7 @@ def prepare_surface_light(
     moves_camera = bool(changed_inputs & CAMERA_INPUTS)
     # light on surfaces cannot follow a change of any other input
     can_follow = changed_inputs <= FREE_INPUTS
-    if not moves_camera or not can_follow:
-        return
-    state = verifier.run_state
-    refusal = _find_light_refusal(problem.renderer, state.spp, n_images)
-    state.predictor_refusal = refusal
-    if refusal is not None:
-        return
-    title = "finding the light on surfaces"
-    verifier.progress_stages.begin(
-        "transport", title, N_LIGHTS, hint="`specialise=false` leaves it out"
-    )
-    light = SurfaceLight(problem, 0, light_u=at, moving_coordinates=coordinates)
-    # `prepare` compares predicted images with traced ones, and may refuse.
-    light.prepare(verifier.progress_stages.progress.advance)
-    state.predictor_refusal = light.accuracy_refusal
-    is_accurate = light.accuracy_refusal is None
-    state.predictor = light if is_accurate else None
+    return moves_camera and can_follow
 
 
 def _find_light_refusal(renderer: Renderer, spp: int, n_images: int) -> Refusal | None:

@@ -83,20 +83,15 @@ def count_predictions(
     interval = None
     # Several predictions of one unit do not show how much units differ. A single
     # prediction has an interval, the one of a single independent trial.
-    has_several_units = len(unit_size) > 1
-    is_single_prediction = len(right) == 1
-    if has_several_units or is_single_prediction:
+    if len(unit_size) > 1 or len(right) == 1:
         interval = rate_interval(right_in_unit, unit_size)
-    outcome_counts = None
-    if outcome is not None:
-        is_wrong = right == 0
-        outcome_counts = _count_outcomes(outcome[is_wrong])
+    is_wrong = right == 0
     return CountedPredictions(
         configurations=len(right),
         correct=int(right.sum()),
         accuracy=mean_rate(right_in_unit, unit_size),
         interval=interval,
-        outcomes=outcome_counts,
+        outcomes=None if outcome is None else _count_outcomes(outcome[is_wrong]),
     )
 
 
@@ -246,15 +241,10 @@ class Predictions:
         for model, name in enumerate(models):
             images = np.flatnonzero(both_counted[:, model])
             if len(images):
-                unit_of_image = units.find_cluster(images)
-                pairs.append(
-                    _compare_pairs(
-                        name,
-                        right[:, images, model],
-                        outcome[:, images, model],
-                        np.asarray(unit_of_image),
-                    )
-                )
+                draws = np.asarray(units.find_cluster(images))
+                model_right = right[:, images, model]
+                model_outcome = outcome[:, images, model]
+                pairs.append(_compare_pairs(name, model_right, model_outcome, draws))
         return pairs
 
 
@@ -326,16 +316,11 @@ class TableAxis:
         predictions = pd.DataFrame({"right": right, "unit": units, "outcome": outcome})
         axis_rows = list[AxisRow]()
         for index, group in predictions.groupby(self.value_index):
-            counts = count_predictions(
-                group.right, group.unit, group.outcome.to_numpy()
-            )
+            outcomes = group.outcome.to_numpy()
+            counts = count_predictions(group.right, group.unit, outcomes)
+            value = self.values[index]
             axis_rows.append(
-                AxisRow(
-                    axis=self.name,
-                    unit=self.unit,
-                    value=self.values[index],
-                    **vars(counts),
-                )
+                AxisRow(axis=self.name, unit=self.unit, value=value, **vars(counts))
             )
         return axis_rows
 
@@ -366,30 +351,53 @@ def make_map(
     if width * height > MAX_CELLS:
         return None
     cell = y_axis.value_index * width + x_axis.value_index  # (n,) counted row by row
-
-    def sum_over_cells(
-        cells: npt.NDArray[np.integer[Any]],
-        weights: npt.NDArray[np.float64] | None = None,
-    ) -> Any:
-        """Return the sum of the weights in each cell, (height, width)."""
-        sums = np.bincount(cells, weights, minlength=width * height)
-        return sums.reshape(height, width)
-
-    is_known = ~np.isnan(margin)
-    n_margins = sum_over_cells(cell[is_known])
-    margin_sum = sum_over_cells(cell[is_known], margin[is_known])
-    no_margins = np.full(n_margins.shape, np.nan)
-    mean_margin = np.divide(margin_sum, n_margins, out=no_margins, where=n_margins > 0)
+    shape = (height, width)
     return SweepMap(
         axes=(_describe_map_axis(x_axis), _describe_map_axis(y_axis)),
         over=[axis.name for axis in axes[2:]],
-        configurations=sum_over_cells(cell).tolist(),
-        correct=sum_over_cells(cell[right]).tolist(),
-        margin=[
-            [None if math.isnan(value) else value for value in row]
-            for row in mean_margin.tolist()
-        ],
+        configurations=_sum_over_cells(cell, shape).tolist(),
+        correct=_sum_over_cells(cell[right], shape).tolist(),
+        margin=_average_margins(cell, margin, shape),
     )
+
+
+def _sum_over_cells(
+    cell: npt.NDArray[np.integer[Any]],
+    shape: tuple[int, int],
+    weights: npt.NDArray[np.float64] | None = None,
+) -> Any:
+    """Return the sum of the weights in each cell of a map, (height, width).
+
+    Args:
+        cell: (n,) index of the cell of each prediction, counted row by row.
+        shape: (height, width) of the map.
+        weights: (n,) what is summed; None counts the predictions.
+    """
+    height, width = shape
+    return np.bincount(cell, weights, minlength=width * height).reshape(height, width)
+
+
+def _average_margins(
+    cell: npt.NDArray[np.integer[Any]],
+    margin: npt.NDArray[np.float64],
+    shape: tuple[int, int],
+) -> list[list[float | None]]:
+    """Return the mean margin of each cell of a map; None if no margin is known.
+
+    Args:
+        cell: (n,) index of the cell of each prediction, counted row by row.
+        margin: (n,) margin of each prediction; NaN if it is not a number.
+        shape: (height, width) of the map.
+    """
+    is_known = ~np.isnan(margin)
+    n_margins = _sum_over_cells(cell[is_known], shape)
+    margin_sum = _sum_over_cells(cell[is_known], shape, margin[is_known])
+    no_margins = np.full(n_margins.shape, np.nan)
+    mean_margin = np.divide(margin_sum, n_margins, out=no_margins, where=n_margins > 0)
+    return [
+        [None if math.isnan(value) else value for value in row]
+        for row in mean_margin.tolist()
+    ]
 
 
 def _order_for_map(axes: Sequence[TableAxis]) -> list[TableAxis]:
@@ -476,6 +484,7 @@ class SweepResult:
 
 MAX_PIXELS = 1 << 22  # maximum size of an imported image
 MAX_LISTED_VALUES = 96  # maximum number of values of a parameter with a table
+MAX_LISTED_NAMES = 20  # maximum number of names of objects or models in a summary
 STORED_BATCH = 1000  # number of rows that are stored together
 
 
@@ -494,23 +503,38 @@ def import_threedb(
     """
     default = make_default_name(folder.resolve().name, ["3db"])
     with RunDirectory.create(run, overwrite=overwrite, default=default) as directory:
-        lines = read_threedb(folder)
-        while batch := list(islice(lines, STORED_BATCH)):
-            for row, image_file in batch:
-                if image_file is not None:
-                    thumbnail = thumbnails.make_thumbnail(read_image(image_file))
-                    thumbnails.write_thumbnail(directory.path, row.step, thumbnail)
-            directory.append_rows(*(row for row, _ in batch))
+        _store_threedb_rows(folder, directory)
         rows = read_sweep(directory.path)
-        if rows.empty:
-            raise FileFormatError(
-                f"{folder}: expected the log of 3DB with at least "
-                "one line, got an empty one"
-            )
+        _check_log_not_empty(rows, folder)
         summary = _summarize_threedb(rows, directory.path, folder)
         write_sweep_page(directory.path, summary)
         directory.write_summary(summary)
         return directory.path
+
+
+def _check_log_not_empty(rows: pd.DataFrame, folder: Path) -> None:
+    """Raise an error if a folder of 3DB has no rows."""
+    if rows.empty:
+        raise FileFormatError(
+            f"{folder}: expected the log of 3DB with at least "
+            "one line, got an empty one"
+        )
+
+
+def _store_threedb_rows(folder: Path, directory: RunDirectory) -> None:
+    """Store the rows of a folder of 3DB, and thumbnails of its images.
+
+    Args:
+        folder: folder of 3DB.
+        directory: run directory.
+    """
+    lines = read_threedb(folder)
+    while batch := list(islice(lines, STORED_BATCH)):
+        for row, image_file in batch:
+            if image_file is not None:
+                thumbnail = thumbnails.make_thumbnail(read_image(image_file))
+                thumbnails.write_thumbnail(directory.path, row.step, thumbnail)
+        directory.append_rows(*(row for row, _ in batch))
 
 
 def _summarize_threedb(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSummary:
@@ -524,14 +548,6 @@ def _summarize_threedb(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSumm
         folder: folder of 3DB.
     """
     right = np.asarray(rows["correct"] == 1)
-    tables = list[AxisRow]()
-    for name in rows.attrs["units"]:  # the keys are the parameters
-        values, indices = np.unique(rows[name].astype(object), return_inverse=True)
-        # A parameter with one value did not vary. A table of very many values would be
-        # unreadable.
-        if 1 < len(values) <= MAX_LISTED_VALUES:
-            axis = TableAxis(name, "", values.tolist(), indices)
-            tables += axis.make_rows(right, rows["unit"])
     names = {
         column: _join_names(rows, column)
         for column in ("object", "environment", "model")
@@ -553,7 +569,7 @@ def _summarize_threedb(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSumm
         ending=FINISHED,
         planned=len(rows),
         answers=dict(wrong_labels.most_common(MAX_LISTED_PREDICTIONS)),
-        axes=tables,
+        axes=_count_by_parameter(rows, right),
         grid={},
         samples=1,
         renders={"sweep": len(rows)},
@@ -563,13 +579,34 @@ def _summarize_threedb(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSumm
     )
 
 
+def _count_by_parameter(
+    rows: pd.DataFrame, right: npt.NDArray[np.bool_]
+) -> list[AxisRow]:
+    """Return the rows of the tables of all parameters that vary.
+
+    Args:
+        rows: rows of the sweep.
+        right: (n,) whether each prediction is right.
+    """
+    tables = list[AxisRow]()
+    for name in rows.attrs["units"]:  # the keys are the parameters
+        values, indices = np.unique(rows[name].astype(object), return_inverse=True)
+        # A parameter with one value did not vary. A table of very many values would be
+        # unreadable.
+        if 1 < len(values) <= MAX_LISTED_VALUES:
+            axis = TableAxis(name, "", values.tolist(), indices)
+            tables += axis.make_rows(right, rows["unit"])
+    return tables
+
+
 def _join_names(rows: pd.DataFrame, column: str) -> str:
-    """Return the names in a column, the first 20; "unknown" if there is none."""
+    """Return the first `MAX_LISTED_NAMES` names in a column; "unknown" without any."""
     names = rows[column].unique().tolist() if column in rows else []
     if not names:
         return "unknown"
-    more = f" and {len(names) - 20} more" if len(names) > 20 else ""
-    return ",".join(map(str, names[:20])) + more
+    n_unlisted = len(names) - MAX_LISTED_NAMES
+    more = f" and {n_unlisted} more" if n_unlisted > 0 else ""
+    return ",".join(map(str, names[:MAX_LISTED_NAMES])) + more
 
 
 def read_image(path: Path) -> object:

@@ -40,6 +40,15 @@ HARMLESS = {
 }
 """Changes that have no meaning, after which the prediction should be the same."""
 Grid = dict[str, object]  # values of each parameter of the grid, or a range of them
+# Both commands have these settings, but a sweep has its own values of them.
+SETTINGS_NOT_OF_ATTACK = (
+    "controls",
+    "texture_resolution",
+    "spp",
+    "seed",
+    "threads",
+    "deterministic",
+)
 
 
 class SweepConfig(SceneConfig):
@@ -314,19 +323,10 @@ class SweepConfig(SceneConfig):
             stated_settings: settings that the sweep itself states, by name.
         """
         attack_config = AttackConfig.from_yaml(file)
-        # Both commands have these settings, but a sweep has its own values of them.
-        excluded = (
-            "controls",
-            "texture_resolution",
-            "spp",
-            "seed",
-            "threads",
-            "deterministic",
-        )
         settings = {
             name: value
             for name, value in cls.get_shared_settings(attack_config).items()
-            if name not in excluded
+            if name not in SETTINGS_NOT_OF_ATTACK
         }
         has_grid = bool(stated_settings.get("grid"))
         has_controls = bool(stated_settings.get("controls"))
@@ -377,14 +377,19 @@ def _parse_axis(axis: Any) -> str | list[Any]:
         if is_range:
             return text
         axis = [part.strip() for part in text.split(",") if part.strip()]
-    if hasattr(axis, "tolist"):  # an array of NumPy or PyTorch
-        axis = axis.tolist()
-    if not isinstance(axis, (range, tuple, list)):
-        axis = [axis]
-    values = [value.item() if hasattr(value, "item") else value for value in axis]
+    values = _to_python_values(axis)
     are_invalid = any(
         value is None or isinstance(value, (bool, list, Mapping)) for value in values
     )
     if not values or are_invalid:
         raise ValueError("not values")
     return [parse_number_or_text(value) for value in values]
+
+
+def _to_python_values(axis: Any) -> list[Any]:
+    """Return an array, a sequence or a single value as a list of Python's values."""
+    if hasattr(axis, "tolist"):  # an array of NumPy or PyTorch
+        axis = axis.tolist()
+    if not isinstance(axis, (range, tuple, list)):
+        axis = [axis]
+    return [value.item() if hasattr(value, "item") else value for value in axis]

@@ -21,6 +21,7 @@ import numpy.typing as npt
 import pandas as pd
 import torch
 from scipy.special import xlogy
+from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks.domain import split_into_batches
@@ -28,7 +29,7 @@ from advsearch.engine.loading import fit_camera, load_scene
 from advsearch.engine.record import read_judgement
 from advsearch.options import OUT_OF_VIEW
 from advsearch.progress import Progress
-from advsearch.questions.sweep.job import Job, SceneLoader
+from advsearch.questions.sweep.job import Job, SceneLoader, SweptScene
 from advsearch.questions.sweep.result import count_independent_predictions
 from advsearch.questions.sweep.summary import SurfaceMap, SurfacePart, SurfaceTable
 from advsearch.report.figures import render_figure
@@ -162,10 +163,10 @@ def compare_parts(
     if is_compared.any():
         compared_parts = part_indices[is_compared]
         parts.loc[compared_parts] = _compute_comparison(counts, compared_parts)
+    significant = parts.p <= SIGNIFICANCE_LEVEL
+    strength = _compute_strength(parts)
     return parts.assign(
-        compared=is_compared,
-        significant=parts.p <= SIGNIFICANCE_LEVEL,
-        strength=_compute_strength(parts),
+        compared=is_compared, significant=significant, strength=strength
     )
 
 
@@ -215,6 +216,9 @@ def _compute_comparison(counts: PartCounts, parts: Int64Array) -> pd.DataFrame:
     return pd.DataFrame(columns, index=parts, columns=list(COMPARISON_COLUMNS))
 
 
+STATISTIC_TOLERANCE = 1e-9  # statistics that differ by less, by rounding, are equal
+
+
 def _compute_permutation_p_value(
     counts: PartCounts, k: Int64Array, n: Int64Array, parts: Int64Array
 ) -> Float64Array:
@@ -230,25 +234,33 @@ def _compute_permutation_p_value(
         n: (m,) number of these images.
         parts: (m,) indices of the compared parts.
     """
-    images = counts.n_images
-    failures = counts.n_failures
     # The number of images that show a part is the same in all permutations. Only the
     # number of failures among them changes.
     max_statistics = np.sort(
         [
-            _compute_likelihood_ratio(
-                failure_counts[parts].astype(np.int64), n, failures, images
-            ).max()
+            _compute_statistic(counts, failure_counts[parts].astype(np.int64), n).max()
             for failure_counts in counts.permuted_counts
         ]
     )
-    statistic = _compute_likelihood_ratio(k, n, failures, images)
+    statistic = _compute_statistic(counts, k, n)
     n_permutations = len(max_statistics)
-    # number of permutations whose largest statistic is at least that of the part; the
-    # tolerance is for rounding
-    tolerance = 1e-9
-    n_above = n_permutations - np.searchsorted(max_statistics, statistic - tolerance)
+    n_below = np.searchsorted(max_statistics, statistic - STATISTIC_TOLERANCE)
+    # permutations whose largest statistic is at least that of the part
+    n_above = n_permutations - n_below
     return np.asarray((1 + n_above) / (1 + n_permutations))
+
+
+def _compute_statistic(
+    counts: PartCounts, k: Int64Array, n: Int64Array
+) -> Float64Array:
+    """Compute the likelihood ratio statistic (m,) of parts from `counts` of all images.
+
+    Args:
+        counts: counts of all parts.
+        k: (m,) number of failures among the images that show each part.
+        n: (m,) number of these images.
+    """
+    return _compute_likelihood_ratio(k, n, counts.n_failures, counts.n_images)
 
 
 def _compute_likelihood_ratio(
@@ -365,6 +377,13 @@ class SurfaceCounts:
         for model, failed in wrong_by_model.items():
             self.part_counts_of_model[model].add_image(visible_parts, failed)
 
+    def compare_all(self) -> list[dict[str, pd.DataFrame]]:
+        """Return for each model the comparison of its parts, by the kind of the parts."""
+        return [
+            _compare_kinds(part_counts, self.parts)
+            for part_counts in self.part_counts_of_model
+        ]
+
     def summarize_kind(
         self,
         object_name: str,
@@ -388,12 +407,6 @@ class SurfaceCounts:
         """
         is_worse = compared.significant & (compared.difference > 0)
         is_better = compared.significant & (compared.difference < 0)
-        strongest = list[SurfacePart]()
-        for is_candidate in (is_worse, is_better):
-            strongest += [
-                self._describe_part(part, counts, compared)
-                for part in self._select_spread(compared[is_candidate])
-            ]
         # `counts` has the parts of all kinds, `compared` only those of this one.
         visible_counts = counts.visible_counts[self.parts.part_slices[kind]]
         return SurfaceTable(
@@ -405,8 +418,26 @@ class SurfaceCounts:
             compared=int(compared["compared"].sum()),
             worse=int(is_worse.sum()),
             better=int(is_better.sum()),
-            strongest=strongest,
+            strongest=[
+                *self._list_strongest(counts, compared, is_worse),
+                *self._list_strongest(counts, compared, is_better),
+            ],
         )
+
+    def _list_strongest(
+        self, counts: PartCounts, compared: pd.DataFrame, is_candidate: pd.Series
+    ) -> list[SurfacePart]:
+        """Return the strongest of some parts, no two of them close to each other.
+
+        Args:
+            counts: counts of a model.
+            compared: comparison of the parts, from `compare_parts`.
+            is_candidate: whether each part may be listed.
+        """
+        return [
+            self._describe_part(part, counts, compared)
+            for part in self._select_spread(compared[is_candidate])
+        ]
 
     def _select_spread(self, candidates: pd.DataFrame) -> list[int]:
         """Select the strongest parts such that no two are close to each other.
@@ -443,6 +474,7 @@ class SurfaceCounts:
         n_visible_right = n_visible - n_visible_wrong
         n_hidden_right = n_hidden - n_hidden_wrong
         u, v = self.parts.center_uvs[part].tolist()
+        numbers = compared.loc[part]
         return SurfacePart(
             face=int(self.parts.face_of_part[part]),
             u=u,
@@ -450,12 +482,9 @@ class SurfaceCounts:
             center=self.parts.centers[part].tolist(),
             visible=count_independent_predictions(n_visible_right, n_visible),
             hidden=count_independent_predictions(n_hidden_right, n_hidden),
-            difference=float(compared.loc[part, "difference"]),
-            interval=(
-                float(compared.loc[part, "low"]),
-                float(compared.loc[part, "high"]),
-            ),
-            p=float(compared.loc[part, "p"]),
+            difference=float(numbers["difference"]),
+            interval=(float(numbers["low"]), float(numbers["high"])),
+            p=float(numbers["p"]),
         )
 
 
@@ -514,31 +543,51 @@ def _make_counts(
         assets: the objects by name.
         wrong: (scenes, images, models) 1, 0 or UNKNOWN, from `_read_wrong`.
     """
-    job = scenes.job
-    draws = _find_draws(scenes, wrong, job)
-    n_models = len(job.models)
+    draws = _find_draws(scenes, wrong, scenes.job)
+    name_of_scene = [scene.object_name for scene in scenes.job.scenes]
     counts = dict[str, SurfaceCounts]()
     for object_index, (name, asset) in enumerate(assets.items()):
+        has_object = np.array([scene_name == name for scene_name in name_of_scene])
+        model_seeds = _make_model_seeds(scenes.job, object_index)
         parts = SurfaceParts(asset.mesh)
-        has_object = np.array(
-            [named_scene.object_name == name for named_scene in job.scenes]
+        part_counts = _make_all_part_counts(
+            parts, wrong[has_object], draws[has_object], model_seeds
         )
-        # Each pair of an object and a model has a seed of its own, and so permutations
-        # of its own.
-        model_seeds = [
-            seeds.derive_seed(
-                job.config.seed, "surface", object_index * n_models + model
-            )
-            for model in range(n_models)
-        ]
-        part_counts = [
-            _make_part_counts(
-                parts, wrong[has_object][..., model], draws[has_object], seed
-            )
-            for model, seed in enumerate(model_seeds)
-        ]
         counts[name] = SurfaceCounts(parts, part_counts)
     return counts
+
+
+def _make_all_part_counts(
+    parts: SurfaceParts,
+    wrong: npt.NDArray[np.int8],
+    draws: Int64Array,
+    model_seeds: Sequence[int],
+) -> list[PartCounts]:
+    """Create the counts of one object for each model, before any image is added.
+
+    Args:
+        parts: parts of the object.
+        wrong: (scenes, images, models) 1, 0 or UNKNOWN.
+        draws: (scenes, images) the draw of each image.
+        model_seeds: seed of the permutations for each model.
+    """
+    return [
+        _make_part_counts(parts, wrong[..., model], draws, seed)
+        for model, seed in enumerate(model_seeds)
+    ]
+
+
+def _make_model_seeds(job: Job, object_index: int) -> list[int]:
+    """Return the seed of the permutations of an object for each model.
+
+    Each pair of an object and a model has a seed of its own, and so permutations of its
+    own.
+    """
+    n_models = len(job.models)
+    pair_numbers = [object_index * n_models + model for model in range(n_models)]
+    return [
+        seeds.derive_seed(job.config.seed, "surface", number) for number in pair_numbers
+    ]
 
 
 def _find_draws(
@@ -550,11 +599,8 @@ def _find_draws(
     all sizes of images, so those of the first size are used.
     """
     n_scenes, images_per_scene, _ = wrong.shape
-    units = (
-        scenes.load_scene(0)
-        .configurations_by_size[job.image_sizes[0]]
-        .independent_units
-    )
+    configurations = scenes.load_scene(0).configurations_by_size[job.image_sizes[0]]
+    units = configurations.independent_units
     image_numbers = np.arange(n_scenes * images_per_scene)
     draws = np.asarray(units.find_cluster(image_numbers))
     return draws.reshape(n_scenes, images_per_scene)
@@ -596,27 +642,56 @@ def _count_scene(
         counts: counts of the scene's object.
         progress: advances by the number of predictions.
     """
-    job = scenes.job
     swept_scene = scenes.load_scene(scene)
     n_images, n_models = wrong.shape
     for batch in split_into_batches(0, n_images, BATCH_SIZE):
-        for size in dict.fromkeys(job.image_sizes):
-            models = [
-                model for model in range(n_models) if job.image_sizes[model] == size
-            ]
-            # The scenes before this one have the same number of images each.
-            configurations = swept_scene.configurations_by_size[
-                size
-            ].make_configurations(batch.start, len(batch), before=scene * n_images)
-            # at least `MIN_RAYS` rays along the shorter side of the image
-            rays_per_pixel = ceil(MIN_RAYS / min(size))
-            renderer = swept_scene.renderer_of_size[size]
-            for number_in_scene, u in zip(batch, configurations, strict=True):
-                surfaces = renderer.find_surfaces(u, rays_per_pixel)
-                counts.add_image(
-                    surfaces, _select_known(wrong[number_in_scene], models)
-                )
+        for size in dict.fromkeys(scenes.job.image_sizes):
+            _count_batch(swept_scene, size, batch, wrong, counts)
         progress.advance(len(batch) * n_models)
+
+
+def _count_batch(
+    scene: SweptScene,
+    size: tuple[int, int],
+    batch: range,
+    wrong: npt.NDArray[np.int8],
+    counts: SurfaceCounts,
+) -> None:
+    """Count the visible parts in consecutive images of one size.
+
+    Args:
+        scene: the scene.
+        size: (height, width) of the images.
+        batch: numbers of the images in the scene.
+        wrong: (images, models) 1, 0 or UNKNOWN, of all images of the scene.
+        counts: counts of the scene's object.
+    """
+    # The scenes before this one have the same number of images each.
+    images_before = scene.number * len(wrong)
+    batch_u = scene.configurations_by_size[size].make_configurations(
+        batch.start, len(batch), before=images_before
+    )
+    images_surfaces = _find_batch_surfaces(scene, size, batch_u)
+    models = scene.job.list_models_of_size(size)
+    for number, surfaces in zip(batch, images_surfaces, strict=True):
+        counts.add_image(surfaces, _select_known(wrong[number], models))
+
+
+def _find_batch_surfaces(
+    scene: SweptScene, size: tuple[int, int], batch_u: Tensor
+) -> Iterator[Surfaces]:
+    """Find the visible surface in each of several images of a scene, one by one.
+
+    Args:
+        scene: the scene.
+        size: (height, width) of the images.
+        batch_u: (n, d) configurations of the images.
+    """
+    renderer = scene.renderer_of_size[size]
+    # at least `MIN_RAYS` rays along the shorter side of the image
+    rays_per_pixel = ceil(MIN_RAYS / min(size))
+    for u in batch_u:
+        yield renderer.find_surfaces(u, rays_per_pixel)
 
 
 def _select_known(
@@ -652,21 +727,34 @@ def permute_draws(
         wrong. None if each image has a draw of its own.
     """
     _, draw_sizes = np.unique(draws, return_counts=True)
-    n_draws = len(draw_sizes)
     is_independent = draw_sizes.max(initial=1) == 1
     if is_independent:
         return None
     is_known = wrong != UNKNOWN
     is_wrong = wrong == 1
     # (draws, images of a draw): row k has the indices of the images of draw k
-    images_of_draw = np.argsort(draws, kind="stable").reshape(n_draws, -1)
+    images_of_draw = np.argsort(draws, kind="stable").reshape(len(draw_sizes), -1)
+    permuted_is_wrong = _permute_rows(is_wrong, images_of_draw, seed)
+    return np.packbits(permuted_is_wrong[:, is_known], axis=0)
+
+
+def _permute_rows(
+    is_wrong: npt.NDArray[np.bool_], images_of_draw: npt.NDArray[np.intp], seed: int
+) -> npt.NDArray[np.bool_]:
+    """Return predictions (N_PERMUTATIONS, n) that are permuted among the draws.
+
+    Args:
+        is_wrong: (n,) whether each prediction is wrong.
+        images_of_draw: (draws, images of a draw) indices of the images of each draw.
+        seed: seed of the permutations.
+    """
     generator = np.random.default_rng(seed)
-    permuted_is_wrong = np.zeros((N_PERMUTATIONS, len(wrong)), bool)
+    permuted_is_wrong = np.zeros((N_PERMUTATIONS, len(is_wrong)), bool)
     for permutation in permuted_is_wrong:  # a view of one row, which is filled
         # The images of each draw get the predictions of another draw.
-        source_images = images_of_draw[generator.permutation(n_draws)]
+        source_images = images_of_draw[generator.permutation(len(images_of_draw))]
         permutation[images_of_draw] = is_wrong[source_images]
-    return np.packbits(permuted_is_wrong[:, is_known], axis=0)
+    return permuted_is_wrong
 
 
 def _write_map(
@@ -690,10 +778,7 @@ def _write_map(
         "models": np.array(models),
     }
     for number, (name, object_counts) in enumerate(counts.items()):
-        comparisons = [
-            _compare_kinds(model_counts, object_counts.parts)
-            for model_counts in object_counts.part_counts_of_model
-        ]
+        comparisons = object_counts.compare_all()
         for array_name, array in _list_arrays(object_counts, comparisons).items():
             arrays[f"{array_name}_{number}"] = array
         panels += _make_panels(assets[name], object_counts, comparisons, name, models)
@@ -806,14 +891,26 @@ def _list_arrays(
         "wrong": np.stack([part_counts.wrong_counts for part_counts in model_counts]),
     }
     for column in ("difference", "low", "high", "p"):
-        # The columns of all kinds, one after the other, are in the order of the parts.
-        column_of_model = [
-            np.concatenate([compared[column] for compared in compared_by_kind.values()])
-            for compared_by_kind in comparisons
-        ]
-        arrays[column] = np.stack(column_of_model).astype(np.float32)
+        arrays[column] = _stack_comparisons(comparisons, column)
     arrays["map"] = counts.parts.face_uvs.astype(np.float32)
     return arrays
+
+
+def _stack_comparisons(
+    comparisons: Sequence[Mapping[str, pd.DataFrame]], column: str
+) -> npt.NDArray[np.float32]:
+    """Return a column of the comparisons of all models, (models, parts).
+
+    Args:
+        comparisons: for each model, the comparison of its parts by kind.
+        column: name of the column.
+    """
+    # The columns of all kinds, one after the other, are in the order of the parts.
+    column_of_model = [
+        np.concatenate([compared[column] for compared in compared_by_kind.values()])
+        for compared_by_kind in comparisons
+    ]
+    return np.stack(column_of_model).astype(np.float32)
 
 
 def _compute_grey_colors(
@@ -910,15 +1007,33 @@ def _render_views(asset: ObjectAsset, parts: SurfaceParts) -> Iterator[MapView]:
         )
         to_world = camera_to_world(viewed, aspect=1.0).astype(np.float32)
         surfaces = scene.find_surfaces({"camera.to_world": torch.from_numpy(to_world)})
-        is_object = surfaces.visible_mask(OBJECT).numpy()
-        face = surfaces.face_index.numpy()[is_object]
-        uv = surfaces.uv.numpy()[is_object].astype(np.float64)
-        cells = np.full(is_object.shape, -1, np.int64)
-        cells[is_object] = parts.find_cells(face, uv)
-        cosine = np.clip(surfaces.normal.numpy() @ np.array(LIGHT_DIRECTION), 0.0, 1.0)
-        # never so dark that colors are hard to distinguish
-        shade = MIN_SHADE + LIT_SHADE * cosine
-        yield MapView(f"{azimuth:g}°, {elevation:g}° up", cells, shade)
+        title = f"{azimuth:g}°, {elevation:g}° up"
+        cells = _find_cell_of_pixels(surfaces, parts)
+        yield MapView(title, cells, _compute_shade(surfaces))
+
+
+def _compute_shade(surfaces: Surfaces) -> Float64Array:
+    """Return the brightness of each pixel (H, W) in [0, 1], by its surface's normal.
+
+    It is never so dark that colors are hard to distinguish.
+    """
+    cosine = np.clip(surfaces.normal.numpy() @ np.array(LIGHT_DIRECTION), 0.0, 1.0)
+    return np.asarray(MIN_SHADE + LIT_SHADE * cosine)
+
+
+def _find_cell_of_pixels(surfaces: Surfaces, parts: SurfaceParts) -> Int64Array:
+    """Return the cell of the object's map in each pixel (H, W); -1 without the object.
+
+    Args:
+        surfaces: the surface that each pixel shows.
+        parts: parts of the object's surface.
+    """
+    is_object = surfaces.visible_mask(OBJECT).numpy()
+    face = surfaces.face_index.numpy()[is_object]
+    uv = surfaces.uv.numpy()[is_object].astype(np.float64)
+    cells = np.full(is_object.shape, -1, np.int64)
+    cells[is_object] = parts.find_cells(face, uv)
+    return cells
 
 
 def _draw_panels(panels: Sequence[Panel], figure: Any) -> None:
@@ -933,35 +1048,50 @@ def _draw_panels(panels: Sequence[Panel], figure: Any) -> None:
     import matplotlib as mpl  # takes long to import
 
     limit = _find_scale_limit(panels)
-    scale = mpl.cm.ScalarMappable(
-        mpl.colors.Normalize(-limit, limit), mpl.colormaps[COLORMAP]
-    )
+    normalize = mpl.colors.Normalize(-limit, limit)
+    scale = mpl.cm.ScalarMappable(normalize, mpl.colormaps[COLORMAP])
     axes = figure.subplots(
         len(panels), 2, squeeze=False, width_ratios=(1.0, VIEWS_WIDTH)
     )
     for (map_axes, view_axes), panel in zip(axes, panels, strict=True):
         cell_colors = _color_cells(panel, scale)
-        map_axes.imshow(
-            # Row 0 of the cells is at v = 1, the top of the image.
-            cell_colors.reshape(MAP_SIZE, MAP_SIZE, 3),
-            extent=(0, 1, 0, 1),
-            interpolation="nearest",
-        )
-        map_axes.set(xlabel="u", ylabel="v")
-        map_axes.set_title(panel.title)
+        _draw_cells(map_axes, panel.title, cell_colors)
         _draw_views(view_axes, panel.views, cell_colors)
 
-    # One color bar for all rows stands at their right; it need not be as high.
-    shrink = 0.8 if len(panels) == 1 else 0.4
-    bar = figure.colorbar(scale, ax=axes, shrink=shrink, format=_format_percent)
-    bar.set_label(
-        "share of wrong predictions where it is seen,\nless that where it is not"
-    )
+    _add_color_bar(figure, axes, scale)
     patches = [
         mpl.patches.Patch(facecolor=color, label=label)
         for color, label in GREY_LABELS.items()
     ]
     figure.legend(handles=patches, loc="outside lower center", ncols=2)
+
+
+def _add_color_bar(figure: Any, axes: npt.NDArray[Any], scale: Any) -> None:
+    """Add one color bar for all rows of a figure, at their right.
+
+    Args:
+        figure: figure of matplotlib.
+        axes: (rows, 2) axes of its rows.
+        scale: matplotlib's map from differences to colors.
+    """
+    # its height as a fraction of that of all rows
+    shrink = 0.8 if len(axes) == 1 else 0.4
+    bar = figure.colorbar(scale, ax=axes, shrink=shrink, format=_format_percent)
+    bar.set_label(
+        "share of wrong predictions where it is seen,\nless that where it is not"
+    )
+
+
+def _draw_cells(axes: Any, title: str, cell_colors: Float64Array) -> None:
+    """Draw the map of a surface; `cell_colors` (cells, 3) has its cells row by row."""
+    axes.imshow(
+        # Row 0 of the cells is at v = 1, the top of the image.
+        cell_colors.reshape(MAP_SIZE, MAP_SIZE, 3),
+        extent=(0, 1, 0, 1),
+        interpolation="nearest",
+    )
+    axes.set(xlabel="u", ylabel="v")
+    axes.set_title(title)
 
 
 def _color_cells(panel: Panel, scale: Any) -> Float64Array:
@@ -1002,21 +1132,25 @@ def _draw_views(axes: Any, views: Sequence[MapView], cell_colors: Float64Array) 
         row, column = divmod(number, n_columns)
         top = row * VIEW_SIZE
         left = column * VIEW_SIZE
-        is_object = view.cells[..., None] >= 0
-        # Pixels without the object have -1. They are looked up as cell 0 here, and made
-        # white below.
-        shaded = cell_colors[np.maximum(view.cells, 0)] * view.shade[..., None]
-        image = np.where(is_object, shaded, 1.0)
+        image = _shade_view(view, cell_colors)
         mosaic[top : top + VIEW_SIZE, left : left + VIEW_SIZE] = image
-        axes.text(
-            left + 0.5 * VIEW_SIZE,
-            top + 4,
-            view.title,
-            ha="center",
-            va="top",
-            fontsize=7,
-        )
+        center = left + 0.5 * VIEW_SIZE
+        axes.text(center, top + 4, view.title, ha="center", va="top", fontsize=7)
     axes.imshow(mosaic)
+
+
+def _shade_view(view: MapView, cell_colors: Float64Array) -> Float64Array:
+    """Return a view of an object as an image (H, W, 3), white around the object.
+
+    Args:
+        view: the view, with the cell, or -1, and the shade of every pixel.
+        cell_colors: (cells, 3) color of each cell.
+    """
+    is_object = view.cells[..., None] >= 0
+    # Pixels without the object have -1. They are looked up as cell 0 here, and made
+    # white below.
+    shaded = cell_colors[np.maximum(view.cells, 0)] * view.shade[..., None]
+    return np.where(is_object, shaded, 1.0)
 
 
 def _format_percent(value: float, _: object) -> str:

@@ -146,15 +146,10 @@ class ConstantVelocity:
             The tracks with a box, those without, and the boxes without a track.
         """
         box_of_track = self._match(tracks, boxes)
-        assigned = list[_Track]()
-        for track_index, box_index in box_of_track.items():
-            track = tracks[track_index]
-            box = boxes[box_index]
-            # `__call__` has moved the track's box on, by its speed in each missed
-            # frame. `missed` is at least 1, since this frame counts as missed, too.
-            last_detected_box = track.box - track.speed * track.missed
-            speed = (box - last_detected_box) / track.missed
-            assigned.append(_Track(track.number, box, speed, missed=0))
+        assigned = [
+            _continue_track(tracks[track_index], boxes[box_index])
+            for track_index, box_index in box_of_track.items()
+        ]
         used_boxes = set(box_of_track.values())
         free_tracks = [
             track for index, track in enumerate(tracks) if index not in box_of_track
@@ -177,6 +172,15 @@ class ConstantVelocity:
             for track, box in pairs
             if overlap_table[track, box] >= self.overlap
         }
+
+
+def _continue_track(track: _Track, box: Float64Array) -> _Track:
+    """Return a track that has moved on to a frame, with the box (4,) in that frame."""
+    # The track's box has moved on by its speed in each missed frame. `missed` is at
+    # least 1, since this frame counts as missed, too.
+    last_detected_box = track.box - track.speed * track.missed
+    speed = (box - last_detected_box) / track.missed
+    return _Track(track.number, box, speed, missed=0)
 
 
 def compute_overlaps(boxes: Float64Array, box: Float64Array) -> Float64Array:
@@ -227,26 +231,43 @@ def track_drive(
     for frame in frames:
         tracks = track_frame(frame.boxes, frame.scores)
         is_visible = frame.true_box is not None
-        # pairs of overlap and number of the track
         on_object = _find_tracks_on(tracks, frame.true_box, iou)
         is_lost.append(is_visible and not on_object)
-        if not on_object:
-            continue
-        if any(number == last_number for _, number in on_object):
-            continue  # the same track still follows the object
-        _, number = max(on_object)  # the track with the largest overlap
-        if last_number is not None:
+        number = _choose_track(on_object, last_number)
+        if last_number is not None and number != last_number:
             n_switches += 1
         last_number = number
-    # Lengths of the runs of lost frames. A frame without the object ends a run. Each
-    # True counts as 1 in the sum.
-    gaps = [sum(run) for lost, run in itertools.groupby(is_lost) if lost]
     n_visible = sum(frame.true_box is not None for frame in frames)
     return DriveTracking(
         lost=sum(is_lost) / max(1, n_visible),  # no division by 0
         switches=n_switches,
-        gap=max(gaps, default=0),
+        gap=_find_longest_gap(is_lost),
     )
+
+
+def _choose_track(
+    on_object: Sequence[tuple[float, int]], last_number: int | None
+) -> int | None:
+    """Return the number of the track that follows the object from a frame on.
+
+    Args:
+        on_object: overlap and number of the tracks that are on the object.
+        last_number: number of the track that followed it before; None if none did.
+    """
+    if not on_object or any(number == last_number for _, number in on_object):
+        return last_number
+    _, number = max(on_object)  # the track with the largest overlap
+    return number
+
+
+def _find_longest_gap(is_lost: Sequence[bool]) -> int:
+    """Return the length of the longest run of lost frames; 0 if none is lost.
+
+    A frame without the object is not lost, and ends a run.
+    """
+    # Each True counts as 1 in the sum.
+    gaps = [sum(run) for lost, run in itertools.groupby(is_lost) if lost]
+    return max(gaps, default=0)
 
 
 def _find_tracks_on(
