@@ -51,6 +51,7 @@ from advsearch.questions.harden.scenes import (
     ROBUST,
     TRAINING,
     VALIDATION,
+    Job,
     SceneJobs,
 )
 from advsearch.questions.harden.training import ClassifierTrainer, Examples
@@ -616,7 +617,7 @@ class Hardening:
 
 def _make_attack_jobs(
     to_attack: Sequence[tuple[str, int]], steps_factor: int, weights: bytes | None
-) -> list[partial[Any]]:
+) -> list[Job]:
     """Return the jobs that attack held-out scenes.
 
     Args:
