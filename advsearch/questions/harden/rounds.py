@@ -384,11 +384,7 @@ class Rounds:
         stored: those of earlier rounds are sampled again from their seeds, since later
         rounds train on them too.
         """
-        held_back = self.trainer.sample_items(
-            "drawing scenes for the choice of weights",
-            VALIDATION,
-            range(self.n_validation_scenes),
-        )
+        held_back = self._sample_validation_items()
         if not self.finished_rounds:
             self._evaluate_original(held_back)
         pool = list(self.trainer.custom_items)
@@ -404,6 +400,14 @@ class Rounds:
             score, interpolation = self._train(number, pool, n_used, held_back)
             n_used = len(pool)
             self.store_round(number, new_items, score, len(pool), interpolation)
+
+    def _sample_validation_items(self) -> list[Any]:
+        """Sample the items by which weights are chosen."""
+        return self.trainer.sample_items(
+            "drawing scenes for the choice of weights",
+            VALIDATION,
+            range(self.n_validation_scenes),
+        )
 
     def _evaluate_original(self, held_back: Sequence[Any]) -> None:
         """Store round 0, the score of the original model on items of the validation."""
@@ -506,13 +510,15 @@ class Rounds:
             score = self.trainer.evaluate_student(held_back)
             scores[interpolation] = score
             self.progress.advance(1, worst=score.robust)
-            robust = [
-                allowed.robust for allowed in self._select_allowed(scores).values()
-            ]
-            has_fallen = bool(robust) and robust[-1] < max(robust)
-            if has_fallen:
+            if self._has_fallen(scores):
                 break
         return scores
+
+    def _has_fallen(self, scores: Mapping[float, Score]) -> bool:
+        """Return whether the last allowed score is less robust than an earlier one."""
+        allowed_scores = self._select_allowed(scores).values()
+        robust = [score.robust for score in allowed_scores]
+        return bool(robust) and robust[-1] < max(robust)
 
     def _select_allowed(self, scores: Mapping[float, Score]) -> dict[float, Score]:
         """Return the scores with enough clean accuracy, in the same order."""
@@ -554,6 +560,10 @@ class Rounds:
             )
         )
         self._write_results()
+        self._report_round(number, score)
+
+    def _report_round(self, number: int, score: Score) -> None:
+        """Report the accuracies of a round to the user."""
         clean = wording.percent(score.clean)
         worst = wording.percent(score.robust)
         self.progress.message(
