@@ -122,8 +122,10 @@ class SceneJobs:
             (job,) = batch.items
             job_name = f"harden, scene {job.keywords['number']}"
             (value,) = batch.require_value(job_name)
-            stats = executor.stats
-            self.progress.advance(1, **({} if stats is None else stats.progress_counts))
+            worker_counts: dict[str, float | str] = {}
+            if executor.stats is not None:
+                worker_counts = executor.stats.progress_counts
+            self.progress.advance(1, **worker_counts)
             yield index_of_job[id(job)], value
 
     def sample_lessons(
