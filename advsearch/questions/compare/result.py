@@ -214,6 +214,20 @@ def make_compare_view(result: CompareResult) -> ShownResult:
 
     It has a table of all sides, then sections for each pair.
     """
+    sections = [_make_side_table(result)]
+    for pair in result.pairs:
+        sections += _make_pair_sections(pair, has_others=len(result.pairs) > 1)
+    summary = "Interrupted before anything was compared."
+    if result.pairs:
+        summary = summarize_difference(result.pairs[0])
+    sweeps = ", ".join(dict.fromkeys(side.run for side in result.sides))
+    facts = {"sweeps": sweeps, "they differ in": ", ".join(result.differ)}
+    # `says_interrupted`: the summary itself states that the run was interrupted.
+    return ShownResult(summary, sections, facts, says_interrupted=not result.pairs)
+
+
+def _make_side_table(result: CompareResult) -> ResultPart:
+    """Return the table of how often each side is right."""
     columns: dict[str, views.Column] = {
         "": lambda side: side.name,
         "right in": lambda side: f"{side.correct} of {side.configurations}",
@@ -227,18 +241,7 @@ def make_compare_view(result: CompareResult) -> ShownResult:
         columns["the others"] = lambda side: wording.format_outcomes(
             side.outcomes, result.task
         )
-    sections = [
-        ResultPart.make_table(result.sides, columns, title="How often each is right")
-    ]
-    for pair in result.pairs:
-        sections += _make_pair_sections(pair, has_others=len(result.pairs) > 1)
-    summary = "Interrupted before anything was compared."
-    if result.pairs:
-        summary = summarize_difference(result.pairs[0])
-    sweeps = ", ".join(dict.fromkeys(side.run for side in result.sides))
-    facts = {"sweeps": sweeps, "they differ in": ", ".join(result.differ)}
-    # `says_interrupted`: the summary itself states that the run was interrupted.
-    return ShownResult(summary, sections, facts, says_interrupted=not result.pairs)
+    return ResultPart.make_table(result.sides, columns, title="How often each is right")
 
 
 def format_prediction_time(seconds: float) -> str:
@@ -298,7 +301,20 @@ def _make_pair_sections(
     sentences = [describe_exclusive_pairs(pair)]
     if has_others:
         sentences.insert(0, summarize_difference(pair))
-    # a table of 2 x 2: the first side right or wrong, by the second side right or wrong
+    yield _make_pair_table(pair, sentences)
+    yield ResultPart("Where one is worse", [*_describe_rules(pair)])
+    yield from _make_parameter_tables(pair)
+    for name in (pair.first, pair.second):
+        yield from _make_picture_parts(name, pair)
+
+
+def _make_pair_table(pair: ComparedPair, sentences: list[str]) -> ResultPart:
+    """Return the table of one side right or wrong, by the other right or wrong.
+
+    Args:
+        pair: the pair of sides.
+        sentences: text above the table.
+    """
     heads = ["", f"{pair.second} right", f"{pair.second} wrong"]
     rows = [
         [f"{pair.first} right", str(pair.both), str(pair.first_only)],
@@ -308,17 +324,8 @@ def _make_pair_sections(
     if pair.units is not None:
         # `units` is their number and `unit` what one is, such as "drive".
         note = UNITS_NOTE.format(units=f"{pair.unit}s")
-    yield ResultPart(
-        f"{pair.first} and {pair.second}, pair by pair",
-        text=sentences,
-        column_heads=heads,
-        rows=rows,
-        note=note,
-    )
-    yield ResultPart("Where one is worse", [*_describe_rules(pair)])
-    yield from _make_parameter_tables(pair)
-    for name in (pair.first, pair.second):
-        yield from _make_picture_parts(name, pair)
+    title = f"{pair.first} and {pair.second}, pair by pair"
+    return ResultPart(title, text=sentences, column_heads=heads, rows=rows, note=note)
 
 
 def _make_parameter_tables(pair: ComparedPair) -> Iterator[ResultPart]:
@@ -327,12 +334,7 @@ def _make_parameter_tables(pair: ComparedPair) -> Iterator[ResultPart]:
     A page shows all tables. A terminal shows those of the `MAX_TABLES` parameters over
     whose values the difference varies most, and a sentence that the page has more.
     """
-    parts_by_title: dict[str, list[PairPart]] = {}
-    for part in pair.parts:
-        # The unit is "1" for plain numbers and "name" for names.
-        has_unit = part.unit not in ("", "1", "name")
-        title = f"{part.parameter}, {part.unit}" if has_unit else part.parameter
-        parts_by_title.setdefault(title, []).append(part)
+    parts_by_title = _group_parts(pair.parts)
     titles_in_terminal = _find_most_varying(parts_by_title)
     heads = [
         "",
@@ -354,6 +356,17 @@ def _make_parameter_tables(pair: ComparedPair) -> Iterator[ResultPart]:
             f"{len(parts_by_title)} parameters."
         )
         yield ResultPart(text=[remark], only_medium="text")
+
+
+def _group_parts(parts: Sequence[PairPart]) -> dict[str, list[PairPart]]:
+    """Return the counts of each parameter by the title of its table."""
+    parts_by_title: dict[str, list[PairPart]] = {}
+    for part in parts:
+        # The unit is "1" for plain numbers and "name" for names.
+        has_unit = part.unit not in ("", "1", "name")
+        title = f"{part.parameter}, {part.unit}" if has_unit else part.parameter
+        parts_by_title.setdefault(title, []).append(part)
+    return parts_by_title
 
 
 def _find_most_varying(parts_by_title: Mapping[str, Sequence[PairPart]]) -> list[str]:
@@ -493,22 +506,35 @@ def _group_pictures(example: PairPicture, pair: ComparedPair) -> list[views.Pict
 def make_compare_claims(result: CompareResult) -> Iterator[views.Claim]:
     """Yield a claim for each pair, about the accuracy of its second side."""
     for pair in result.pairs:
-        # Without units, pairs are independent.
-        method = "Newcombe's, of pairs" if pair.units is None else f"over {pair.unit}s"
-        statement = (
-            f"{summarize_difference(pair)} {describe_exclusive_pairs(pair)} The "
-            f"interval of the difference is {method}."
-        )
         second = next(side for side in result.sides if side.name == pair.second)
-        outcomes = wording.format_outcomes(second.outcomes, result.task)
-        if outcomes:
-            statement += f" Of the others {pair.second} has {outcomes}."
-        extent = results.Extent.from_count(
-            f"configurations in which {pair.second} is right",
-            second.correct,
-            second.configurations,
-            second.interval,
-            second.accuracy,
-            counts_right=True,
-        )
-        yield views.Claim(kind="measured", statement=statement, extent=extent)
+        yield _make_pair_claim(pair, second, result.task)
+
+
+def _make_pair_claim(
+    pair: ComparedPair, second: ComparedSide, task: str
+) -> views.Claim:
+    """Return the claim about the accuracy of the second side of a pair.
+
+    Args:
+        pair: the pair.
+        second: its second side.
+        task: the task that evaluates the predictions.
+    """
+    # Without units, pairs are independent.
+    method = "Newcombe's, of pairs" if pair.units is None else f"over {pair.unit}s"
+    statement = (
+        f"{summarize_difference(pair)} {describe_exclusive_pairs(pair)} The "
+        f"interval of the difference is {method}."
+    )
+    outcomes = wording.format_outcomes(second.outcomes, task)
+    if outcomes:
+        statement += f" Of the others {pair.second} has {outcomes}."
+    extent = results.Extent.from_count(
+        f"configurations in which {pair.second} is right",
+        second.correct,
+        second.configurations,
+        second.interval,
+        second.accuracy,
+        counts_right=True,
+    )
+    return views.Claim(kind="measured", statement=statement, extent=extent)
