@@ -53,14 +53,9 @@ def find_envelope(
     # too large on average: a reserve is added to the required accuracy. Near 1 it is
     # half of the distance to 1.
     required = min(accuracy + ACCURACY_RESERVE, (1.0 + accuracy) / 2.0)
-    box: rules.RuleConditions = ()  # without conditions: everything
-    inside = selection_rows
-    while rules.estimate_interval(inside)[0] < required:  # the lower bound
-        smaller_box = find_best_peel(box, inside, selection_rows)
-        if smaller_box is None:
-            return None
-        box = smaller_box
-        inside = selection_rows[rules.find_covered(box, selection_rows)]
+    box = _peel_until(required, selection_rows)
+    if box is None:
+        return None
     counts = count_right(test_rows[rules.find_covered(box, test_rows)])
     conditions = [condition.row for condition in box]  # as a result stores them
     lower_bound = counts.interval[0]
@@ -70,6 +65,26 @@ def find_envelope(
         accuracy=accuracy,
         confirmed=lower_bound >= accuracy,
     )
+
+
+def _peel_until(
+    required: float, selection_rows: pd.DataFrame
+) -> rules.RuleConditions | None:
+    """Peel a box until the lower bound of its accuracy is large enough; None if it never is.
+
+    Args:
+        required: required lower bound.
+        selection_rows: rows by which the box is chosen.
+    """
+    box: rules.RuleConditions = ()  # without conditions: everything
+    inside = selection_rows
+    while rules.estimate_interval(inside)[0] < required:  # the lower bound
+        smaller_box = find_best_peel(box, inside, selection_rows)
+        if smaller_box is None:
+            return None
+        box = smaller_box
+        inside = selection_rows[rules.find_covered(box, selection_rows)]
+    return box
 
 
 def find_best_peel(
