@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import math
 from itertools import combinations
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -104,15 +104,12 @@ def _find_interacting_pairs(
     }
     pairs = list(combinations(group_of_factor, 2))
     pair_weights = []
-    for factor_a, factor_b in pairs:
-        group_a = group_of_factor[factor_a]
-        group_b = group_of_factor[factor_b]
+    for factors in pairs:
+        group_a, group_b = (group_of_factor[factor] for factor in factors)
         joint_group = cross_groups(group_a, group_b)
         p_value = sample.interaction_p_value(joint_group, group_a, group_b)
         if p_value < SIGNIFICANCE / len(pairs):
-            pair_weights.append(
-                sample.estimate_weight([factor_a, factor_b], joint_group)
-            )
+            pair_weights.append(sample.estimate_weight([*factors], joint_group))
     return pair_weights
 
 
@@ -149,6 +146,20 @@ def cross_groups(first: IntArray, second: IntArray) -> IntArray:
     Two rows are in the same joint group if they are in the same group by both factors.
     """
     return first * (int(second.max()) + 1) + second
+
+
+class _Correction(NamedTuple):
+    """A fraction of the variance without what chance adds, and how it is distributed.
+
+    Attributes:
+        fraction: the corrected fraction.
+        design_effect: by how much clusters make the statistic larger; 1 without them.
+        error_degrees: degrees of freedom of F's denominator; infinity for chi-squared.
+    """
+
+    fraction: float
+    design_effect: float
+    error_degrees: float
 
 
 class ClusteredPredictions:
@@ -233,31 +244,41 @@ class ClusteredPredictions:
             )
 
         n_rows = len(self.correct)
-        degrees = n_groups - 1
-        if self.is_independent:
-            design_effect = 1.0
-            error_degrees = math.inf
-            # adjusted R squared: 1 - (1 - R²) (n - 1) / (n - k)
-            residual_degrees = max(n_rows - n_groups, 1)
-            corrected_fraction = (
-                1.0 - (1.0 - fraction) * (n_rows - 1) / residual_degrees
-            )
-        else:
-            # Independent rows have `degrees` as their expected statistic.
-            design_effect = chance_statistic / degrees
-            error_degrees = float(self.n_clusters - n_groups)
-            corrected_fraction = fraction - chance_statistic / n_rows
-
+        correction = self._correct_fraction(fraction, n_groups, chance_statistic)
+        design_effect = correction.design_effect
         lower_noncentrality, upper_noncentrality = noncentrality_interval(
-            n_rows * fraction / design_effect, degrees, error_degrees
+            n_rows * fraction / design_effect, n_groups - 1, correction.error_degrees
         )
         lower = min(design_effect * lower_noncentrality / n_rows, 1.0)
         upper = min(design_effect * upper_noncentrality / n_rows, 1.0)
         return ParameterWeight(
             parameters=factors,
-            share=max(corrected_fraction, 0.0),
+            share=max(correction.fraction, 0.0),
             interval=(lower, upper),
             parts=n_groups,
+        )
+
+    def _correct_fraction(
+        self, fraction: float, n_groups: int, chance_statistic: float
+    ) -> _Correction:
+        """Subtract from a fraction of the variance what chance adds on average.
+
+        Args:
+            fraction: the explained fraction.
+            n_groups: number of groups.
+            chance_statistic: expected statistic of a factor without any effect.
+        """
+        n_rows = len(self.correct)
+        if self.is_independent:
+            # adjusted R squared: 1 - (1 - R²) (n - 1) / (n - k)
+            residual_degrees = max(n_rows - n_groups, 1)
+            corrected = 1.0 - (1.0 - fraction) * (n_rows - 1) / residual_degrees
+            return _Correction(corrected, design_effect=1.0, error_degrees=math.inf)
+        return _Correction(
+            fraction - chance_statistic / n_rows,
+            # Independent rows have `n_groups - 1` as their expected statistic.
+            design_effect=chance_statistic / (n_groups - 1),
+            error_degrees=float(self.n_clusters - n_groups),
         )
 
     def expected_statistic(self, group: IntArray) -> float:
@@ -308,10 +329,8 @@ class ClusteredPredictions:
             group_weight[is_used],
         )
         between_clusters = self._between_cluster_variance(cell_cluster, cell_residual)
-        return max(
-            (within_groups - between_clusters) / self.variance,
-            MIN_INFLATION * float(n_groups - 1),
-        )
+        excess = (within_groups - between_clusters) / self.variance
+        return max(excess, MIN_INFLATION * float(n_groups - 1))
 
     def _weighted_residual(
         self,
@@ -383,15 +402,25 @@ class ClusteredPredictions:
         if self.is_independent:
             return float(chi2.sf(statistic, degrees))
 
-        expected = self.expected_statistic(joint_group)
-        expected -= self.expected_statistic(first_group)
-        expected -= self.expected_statistic(second_group)
+        expected = self._expected_excess(joint_group, first_group, second_group)
         error_degrees = self.n_clusters - degrees - 1
         # `expected_statistic` is NaN if it is not known: then this is False.
         is_known = expected > 0.0
         if not is_known or error_degrees < 1:
             return 1.0
         return float(f_distribution.sf(statistic / expected, degrees, error_degrees))
+
+    def _expected_excess(
+        self, joint_group: IntArray, first_group: IntArray, second_group: IntArray
+    ) -> float:
+        """Return the expected statistic of an interaction without effect.
+
+        NaN if it is not known. The arguments are those of `interaction_p_value`.
+        """
+        expected = self.expected_statistic(joint_group)
+        expected -= self.expected_statistic(first_group)
+        expected -= self.expected_statistic(second_group)
+        return expected
 
 
 def within_group_variance(
@@ -459,18 +488,10 @@ def find_noncentrality(
 
     def excess_probability(noncentrality: float) -> float:
         """Return P(value <= statistic) - `probability`, which falls to below 0."""
-        is_central = noncentrality <= 0.0
-        if math.isinf(error_degrees):
-            distribution = chi2(degrees) if is_central else ncx2(degrees, noncentrality)
-            cumulative = distribution.cdf(statistic)
-        else:
-            central = f_distribution(degrees, error_degrees)
-            distribution = (
-                central if is_central else ncf(degrees, error_degrees, noncentrality)
-            )
-            cumulative = distribution.cdf(statistic / degrees)  # one of F
-        # scipy returns NaN for a noncentrality that is too large: P is then about 0.
-        return float(np.nan_to_num(cumulative)) - probability
+        cumulative = _compute_cumulative_probability(
+            statistic, degrees, error_degrees, noncentrality
+        )
+        return cumulative - probability
 
     if excess_probability(0.0) <= 0.0:
         return 0.0
@@ -478,3 +499,29 @@ def find_noncentrality(
     while excess_probability(upper_bound) > 0.0:
         upper_bound *= 2.0
     return float(brentq(excess_probability, 0.0, upper_bound, xtol=1e-6))
+
+
+def _compute_cumulative_probability(
+    statistic: float, degrees: int, error_degrees: float, noncentrality: float
+) -> float:
+    """Return the probability of a value up to a statistic.
+
+    Args:
+        statistic: statistic of a noncentral chi-squared distribution, or `degrees`
+            times one of F.
+        degrees: degrees of freedom.
+        error_degrees: degrees of freedom of F's denominator; infinity for chi-squared.
+        noncentrality: noncentrality of the distribution; 0 for a central one.
+    """
+    is_central = noncentrality <= 0.0
+    if math.isinf(error_degrees):
+        distribution = chi2(degrees) if is_central else ncx2(degrees, noncentrality)
+        cumulative = distribution.cdf(statistic)
+    else:
+        central = f_distribution(degrees, error_degrees)
+        distribution = (
+            central if is_central else ncf(degrees, error_degrees, noncentrality)
+        )
+        cumulative = distribution.cdf(statistic / degrees)  # one of F
+    # scipy returns NaN for a noncentrality that is too large: P is then about 0.
+    return float(np.nan_to_num(cumulative))
