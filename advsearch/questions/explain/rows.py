@@ -36,19 +36,7 @@ def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
         `attrs["units"]` maps each parameter, or scene setting, to its unit of
         measurement.
     """
-    frames = []
-    for index, sweep in enumerate(sweeps):
-        rows = sweep.read_rows()
-        for name in SCENE_SETTINGS:
-            if name in rows:
-                full_names = rows[name].astype(object)
-            else:  # rows have no such column if the setting is the same in all of them
-                full_names = pd.Series(getattr(sweep.summary, name), rows.index)
-            rows[name] = full_names.map(wording.format_figure_value)
-        rows["draw"] = name_draws(sweep, rows)
-        rows["image"] = name_images(sweep, rows)
-        frames.append(rows.assign(sweep=index))
-
+    frames = [_read_frame(index, sweep) for index, sweep in enumerate(sweeps)]
     table = pd.concat(frames, ignore_index=True)
     is_repeated = table.duplicated("image")
     table = table[~is_repeated].reset_index(drop=True)
@@ -63,6 +51,28 @@ def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
     table["correct"] = (table["correct"] == 1) & rules.is_in_view(table)
     table.attrs["units"] = units
     return table
+
+
+def _read_frame(index: int, sweep: workbench.StoredSweep) -> pd.DataFrame:
+    """Read the rows of a sweep with columns for its scene.
+
+    The columns "draw" and "image" have the names of the draw and of the image, and
+    "sweep" the index of the sweep.
+
+    Args:
+        index: index of the sweep.
+        sweep: the sweep.
+    """
+    rows = sweep.read_rows()
+    for name in SCENE_SETTINGS:
+        if name in rows:
+            full_names = rows[name].astype(object)
+        else:  # rows have no such column if the setting is the same in all of them
+            full_names = pd.Series(getattr(sweep.summary, name), rows.index)
+        rows[name] = full_names.map(wording.format_figure_value)
+    rows["draw"] = name_draws(sweep, rows)
+    rows["image"] = name_images(sweep, rows)
+    return rows.assign(sweep=index)
 
 
 def _collect_units(frames: Sequence[pd.DataFrame]) -> dict[str, str]:
