@@ -36,7 +36,7 @@ def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
         `attrs["units"]` maps each parameter, or scene setting, to its unit of
         measurement.
     """
-    frames = [_read_frame(index, sweep) for index, sweep in enumerate(sweeps)]
+    frames = [_read_sweep_frame(index, sweep) for index, sweep in enumerate(sweeps)]
     table = pd.concat(frames, ignore_index=True)
     is_repeated = table.duplicated("image")
     table = table[~is_repeated].reset_index(drop=True)
@@ -53,7 +53,7 @@ def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
     return table
 
 
-def _read_frame(index: int, sweep: workbench.StoredSweep) -> pd.DataFrame:
+def _read_sweep_frame(index: int, sweep: workbench.StoredSweep) -> pd.DataFrame:
     """Read the rows of a sweep with columns for its scene.
 
     The columns "draw" and "image" have the names of the draw and of the image, and

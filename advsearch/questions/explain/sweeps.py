@@ -52,10 +52,7 @@ def make_sweep_inside(
         name: sorted(inside[name].unique().tolist()) for name in table.attrs["units"]
     }
     scene_settings = cut_scene_settings(config, values_inside)
-    n_scenes = math.prod(
-        len(settings.split_names(names)) if names else 1
-        for names in scene_settings.values()
-    )
+    n_scenes = _count_scenes_of_settings(scene_settings)
     # An axis that does not vary in the rows keeps its values.
     full_grid = {
         name: values_inside.get(name, values) for name, values in config.grid.items()
@@ -69,6 +66,14 @@ def make_sweep_inside(
     draws = math.ceil(samples / n_configurations) if controls else None
     return make_minimal_config(
         config, grid=grid, controls=controls, samples=draws, seed=seed, **scene_settings
+    )
+
+
+def _count_scenes_of_settings(scene_settings: Mapping[str, str | None]) -> int:
+    """Return the number of combinations of objects, environments and models."""
+    return math.prod(
+        len(settings.split_names(names)) if names else 1
+        for names in scene_settings.values()
     )
 
 
@@ -233,16 +238,11 @@ def make_sweep_along(
         seed: seed of the noise.
     """
     values = list_values_along(table[factor], row[factor])
-    # Parameters, which have a dot in their name, are axes of the grid.
-    grid: dict[str, object] = {
-        name: [row[name]] for name in row if "." in name and is_settable(config, name)
-    }
-    # Object, environment and model are settings.
+    # Object, environment and model are settings; other parameters are axes of the grid.
     scene_settings = _find_scene_settings(config, row)
+    grid = _make_point_grid(config, row)
     if factor in SCENE_SETTINGS:
-        scene_settings[factor] = ",".join(
-            name for value in values for name in find_names(config, factor, str(value))
-        )
+        scene_settings[factor] = _join_matching_names(config, factor, values)
     else:
         grid[factor] = values
     # A parameter must not be set and be an axis at the same time.
@@ -263,6 +263,25 @@ def make_sweep_along(
         cluster=None,
         **scene_settings,
     )
+
+
+def _make_point_grid(
+    config: SweepConfig, row: Mapping[str, float | str]
+) -> dict[str, object]:
+    """Return a grid of a single point: the parameters of a row, which have a dot."""
+    return {
+        name: [row[name]] for name in row if "." in name and is_settable(config, name)
+    }
+
+
+def _join_matching_names(
+    config: SweepConfig, setting: str, values: Sequence[float | str]
+) -> str:
+    """Return the names in a setting that rows write as values, separated by commas."""
+    names: list[str] = []
+    for value in values:
+        names += find_names(config, setting, str(value))
+    return ",".join(names)
 
 
 def _find_scene_settings(
@@ -321,10 +340,9 @@ def select_choices(
         ]
         if choices and all(name in grid for name in parameters):
             # "kind" states the type of the control, if that is not its name.
+            used_names = {*choices, "kind"}
             controls[instance] = {
-                name: value
-                for name, value in options.items()
-                if name in {*choices, "kind"}
+                name: value for name, value in options.items() if name in used_names
             }
     return controls
 
