@@ -19,6 +19,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -374,28 +375,34 @@ class Renderer:
         with torch.no_grad():
             inputs = self.scene.input_assembler(self.space.inputs(u))
             halves, mean = self.trace_independent_radiances(inputs, seed, spp)
-
-            def finish(radiance: Tensor) -> Tensor:
-                """Return the radiance with exposure and backdrop, before the curve."""
-                return self.finish_image(radiance, inputs, u, display=False)
-
+            # with exposure and backdrop, before the curve
+            finish = partial(self.finish_image, inputs=inputs, u=u, display=False)
             clean = finish(mean)
             clean_image = self.formation.map_to_display(clean)
-
-            def display_on_tangent(radiance: Tensor) -> Tensor:
-                """Return the image of radiance on the curve's tangent at `clean`.
-
-                The change along the tangent is extrapolated from a small fraction of
-                the change of radiance, within which the curve is nearly straight.
-                """
-                nearby = torch.lerp(clean, finish(radiance), STRAIGHT_FRACTION)
-                small_change = self.formation.map_to_display(nearby) - clean_image
-                change = small_change / STRAIGHT_FRACTION
-                return self.space.apply_to_image(u, clean_image + change)
-
-            first = display_on_tangent(halves[0])
-            second = display_on_tangent(halves[1])
+            first, second = (
+                self._display_on_tangent(finish(half), clean, clean_image, u)
+                for half in halves
+            )
             return first, second, self.space.apply_to_image(u, clean_image)
+
+    def _display_on_tangent(
+        self, radiance: Tensor, clean: Tensor, clean_image: Tensor, u: Tensor
+    ) -> Tensor:
+        """Return the image of radiance on the tone curve's tangent at `clean`.
+
+        The change along the tangent is extrapolated from a small fraction of the change of
+        radiance, within which the curve is nearly straight.
+
+        Args:
+            radiance: (H, W, 3) radiance before the curve.
+            clean: (H, W, 3) the same without noise.
+            clean_image: (H, W, 3) sRGB, the image of `clean`.
+            u: configuration, for the controls that change the finished image.
+        """
+        nearby = torch.lerp(clean, radiance, STRAIGHT_FRACTION)
+        small_change = self.formation.map_to_display(nearby) - clean_image
+        change = small_change / STRAIGHT_FRACTION
+        return self.space.apply_to_image(u, clean_image + change)
 
     def trace_independent_radiances(
         self, inputs: Mapping[str, Tensor], seed: int, spp: int
@@ -429,11 +436,13 @@ class Renderer:
         with self.scene.limit_window(self.window):
             albedo, normal = self.scene.render_guides(scene_inputs, guide_seed, spp)
         plane_radiance = self.scene.plane_radiance if hides_environment else None
+        denoise = partial(
+            denoise_image, albedo=albedo, normal=normal, plane_radiance=plane_radiance
+        )
         if self.crop is None:
-            return halves, denoise_image(mean, albedo, normal, plane_radiance)
+            return halves, denoise(mean)
         # Only the window is noisy: the surroundings were denoised when they were made.
-        window_mean = self.crop.window.crop_image(mean)
-        clean = denoise_image(window_mean, albedo, normal, plane_radiance)
+        clean = denoise(self.crop.window.crop_image(mean))
         return halves, self.crop.window.paste(clean, self.crop.surrounding_image)
 
     def compute_scene_inputs(self, u: Tensor) -> dict[str, Tensor]:
@@ -473,13 +482,7 @@ class Renderer:
                 _select_scene_inputs(inputs), subdivision
             )
             if "backdrop.front" in inputs:
-                # The first channel is the hidden fraction of the object. Where
-                # something in front hides most of a pixel, no surface of the scene is
-                # visible.
-                is_hidden = inputs["backdrop.front"][..., 0] > 0.5
-                for dim in (0, 1):  # a pixel's value for all of its points
-                    is_hidden = is_hidden.repeat_interleave(subdivision, dim)
-                surfaces.id[is_hidden] = 0  # no surface; depths stay
+                _remove_hidden_surfaces(surfaces, inputs["backdrop.front"], subdivision)
         # The scene is in object sizes.
         object_size = self.scene.description_and_filter[0].size_in_metres
         return replace(
@@ -520,18 +523,32 @@ class Renderer:
             DIFFERENCE_ESTIMATORS if free else frozenset({"secant"})
         )
         try:
-            with torch.inference_mode(False), torch.enable_grad():
-                leaf = u.detach().clone().requires_grad_()
-                value = loss(self(leaf, seed, spp))
-            gradient = None
-            if value.requires_grad:
-                (gradient,) = torch.autograd.grad(value, leaf, allow_unused=True)
+            value, derivative = self._differentiate_loss(loss, u, seed, spp)
         finally:
             self._skipped_estimators = frozenset()
-        # A loss that does not depend on u has no graph, and no gradient.
-        derivative = torch.zeros_like(leaf) if gradient is None else gradient
         if not free:
             self._write_secant_differences(loss, u.detach(), seed, spp, derivative)
+        return value, derivative
+
+    def _differentiate_loss(
+        self, loss: Callable[[Tensor], Tensor], u: Tensor, seed: int, spp: int
+    ) -> tuple[Tensor, Tensor]:
+        """Return a loss of the image of u without graph, and its derivative by autograd.
+
+        Args:
+            loss: function from an image (H, W, 3) sRGB to a scalar.
+            u: (d,) configuration.
+            seed: seed of the noise.
+            spp: samples per pixel.
+        """
+        with torch.inference_mode(False), torch.enable_grad():
+            leaf = u.detach().clone().requires_grad_()
+            value = loss(self(leaf, seed, spp))
+        gradient = None
+        if value.requires_grad:
+            (gradient,) = torch.autograd.grad(value, leaf, allow_unused=True)
+        # A loss that does not depend on u has no graph, and no gradient.
+        derivative = torch.zeros_like(leaf) if gradient is None else gradient
         return value.detach(), derivative
 
     @torch.no_grad()
@@ -586,16 +603,7 @@ class Renderer:
             )
         if not 1 <= spp <= MAX_SPP:
             raise InputError(f"spp: expected 1 to {MAX_SPP} samples a pixel, got {spp}")
-        # An empty configuration has no smallest number. NaN fails both comparisons.
-        is_in_range = True
-        if u.numel():
-            smallest, largest = torch.aminmax(u.detach())
-            is_in_range = bool((smallest >= 0.0) & (largest <= 1.0))
-        if not is_in_range:
-            raise InputError(
-                "render: expected every entry of u in [0, 1]; project u "
-                "before you render it"
-            )
+        _check_in_unit_box(u)
         if u.is_inference() and u.requires_grad:
             raise InputError(
                 "render: u was made in `torch.inference_mode()`, so that nothing can "
@@ -604,15 +612,21 @@ class Renderer:
             )
         with _leave_inference_mode():
             u = u.clone() if u.is_inference() else u
-            # A prediction is differentiated by autograd for all coordinates.
-            if self._predict is not None or not u.requires_grad:
-                return u, u
-            is_by_autograd = self.plan.autograd_mask
-            if bool(is_by_autograd.all()):
-                return u, u
-            # The difference is 0, so that the value is u; the derivative is the mask.
-            autograd_u = u.detach() + is_by_autograd * (u - u.detach())
-            return u, autograd_u
+            return u, self._limit_autograd(u)
+
+    def _limit_autograd(self, u: Tensor) -> Tensor:
+        """Return a configuration that autograd differentiates only as the plan states.
+
+        It is u itself if autograd differentiates all coordinates, or none is needed.
+        """
+        # A prediction is differentiated by autograd for all coordinates.
+        if self._predict is not None or not u.requires_grad:
+            return u
+        is_by_autograd = self.plan.autograd_mask
+        if bool(is_by_autograd.all()):
+            return u
+        # The difference is 0, so that the value is u; the derivative is the mask.
+        return u.detach() + is_by_autograd * (u - u.detach())
 
     def _render_image(
         self, u: Tensor, seed: int, spp: int, *, display: bool = True
@@ -638,22 +652,34 @@ class Renderer:
             camera_seed = seed
             if index > 0:
                 camera_seed = seeds.derive_seed(seed, "camera", index)
-            inputs = self._make_camera_inputs(mount, u)
-            hides_environment = "backdrop.color" in inputs
-            if self.moments:  # an exposure of some time
-                rendered = self._render_exposure(
-                    mount, u, camera_seed, spp, hides_environment
-                )
-            else:
-                rendered = self.render_radiance(
-                    _select_scene_inputs(inputs), camera_seed, spp, hides_environment
-                )
-            images.append(self.finish_image(rendered, inputs, u, display=display))
+            images.append(self._render_camera(mount, u, camera_seed, spp, display))
         if len(images) == 1:
             return images[0]
         # Budgets count configurations: all cameras of a rig are one render.
         self.n_renders = renders_before + 1
         return torch.cat(images, dim=1)
+
+    def _render_camera(
+        self, mount: RigCamera | None, u: Tensor, seed: int, spp: int, display: bool
+    ) -> Tensor:
+        """Render the image (H, W, 3) of one camera, or its radiance before display.
+
+        Args:
+            mount: a camera of a rig; None if the scene has one camera.
+            u: (d,) configuration.
+            seed: seed of the noise.
+            spp: samples per pixel.
+            display: if False, return the radiance that is to be displayed.
+        """
+        inputs = self._make_camera_inputs(mount, u)
+        hides_environment = "backdrop.color" in inputs
+        if self.moments:  # an exposure of some time
+            rendered = self._render_exposure(mount, u, seed, spp, hides_environment)
+        else:
+            rendered = self.render_radiance(
+                _select_scene_inputs(inputs), seed, spp, hides_environment
+            )
+        return self.finish_image(rendered, inputs, u, display=display)
 
     def _make_camera_inputs(
         self, mount: RigCamera | None, u: Tensor, space: InputMapping | None = None
@@ -720,13 +746,7 @@ class Renderer:
             )
             if is_denoised:
                 with torch.no_grad():
-                    guide_seed = seeds.derive_seed(
-                        self.root_seed, "guides", moment_seed
-                    )
-                    albedo, normal = self.scene.render_guides(
-                        inputs, guide_seed, samples
-                    )
-                    moment_guides = torch.cat([albedo, normal], dim=-1)
+                    moment_guides = self._render_guides(inputs, moment_seed, samples)
                     guides = guides + row_weights * moment_guides
         # `render_radiance` has counted each moment.
         self.n_renders = renders_before + 1
@@ -735,6 +755,14 @@ class Renderer:
         # Denoising is added as a change without a graph: so the derivative is that of
         # the image before denoising.
         return exposed + self._compute_denoising_change(exposed, guides)
+
+    def _render_guides(
+        self, inputs: Mapping[str, Tensor], moment_seed: int, spp: int
+    ) -> Tensor:
+        """Render the guides of the denoiser (H, W, 6), albedo and normals, of a moment."""
+        guide_seed = seeds.derive_seed(self.root_seed, "guides", moment_seed)
+        albedo, normal = self.scene.render_guides(inputs, guide_seed, spp)
+        return torch.cat([albedo, normal], dim=-1)
 
     @torch.no_grad()
     def _compute_denoising_change(self, exposed: Tensor, guides: Tensor) -> Tensor:
@@ -772,32 +800,41 @@ class Renderer:
             display: if False, return the radiance before the tone curve.
         """
         inputs = self.replace_photograph_depth(inputs)
-        exposure = inputs.get("camera.exposure")
         if "backdrop.blur" in inputs:
             rendered = blur_image(rendered, float(inputs["backdrop.blur"]))
+        radiance = self._compose_radiance(rendered, inputs)
+        if not display:
+            return radiance
+        image = self.formation.map_to_display(radiance)
+        if "backdrop.noise" in inputs:
+            coverage = rendered[..., 3:4].detach()
+            image = _add_photograph_noise(image, coverage, inputs)
+        return self.space.apply_to_image(u, image)
+
+    def _compose_radiance(
+        self, rendered: Tensor, inputs: Mapping[str, Tensor]
+    ) -> Tensor:
+        """Return rendered radiance (H, W, 3) with exposure, laid over a backdrop.
+
+        Args:
+            rendered: radiance with further channels, as for `finish_image`.
+            inputs: scene inputs, of which exposure and backdrop are applied.
+        """
+        exposure = inputs.get("camera.exposure")
         radiance = rendered[..., :3]
         coat = rendered[..., 7:]  # without channels if the plane is matt
         if exposure is not None:
             radiance = radiance * torch.exp2(exposure)
             coat = coat * torch.exp2(exposure)
-        if "backdrop.color" in inputs:
-            # The photograph is display-linear, which is radiance times the gain, and
-            # has no exposure of ours. Nor has the change of the plane (channels 4 to
-            # 6), which is used relative to the plane's radiance.
-            behind = inputs["backdrop.color"] / self.formation.gain
-            coverage_and_plane = rendered[..., 3:7]
-            layers = torch.cat([radiance, coverage_and_plane, coat], dim=-1)
-            radiance = compose_over_photograph(layers, behind, inputs)
-        if not display:
+        if "backdrop.color" not in inputs:
             return radiance
-        image = self.formation.map_to_display(radiance)
-        if "backdrop.noise" in inputs:
-            # Only where the object is visible: the photograph has its own noise.
-            coverage = rendered[..., 3:4].detach()
-            if "backdrop.front" in inputs:
-                coverage = coverage * (1.0 - inputs["backdrop.front"][..., :1])
-            image = (image + coverage * inputs["backdrop.noise"]).clamp(0.0, 1.0)
-        return self.space.apply_to_image(u, image)
+        # The photograph is display-linear, which is radiance times the gain, and
+        # has no exposure of ours. Nor has the change of the plane (channels 4 to
+        # 6), which is used relative to the plane's radiance.
+        behind = inputs["backdrop.color"] / self.formation.gain
+        coverage_and_plane = rendered[..., 3:7]
+        layers = torch.cat([radiance, coverage_and_plane, coat], dim=-1)
+        return compose_over_photograph(layers, behind, inputs)
 
     @torch.no_grad()
     def replace_photograph_depth(
@@ -917,13 +954,7 @@ class Renderer:
         turn, and else `DEFAULT_STEP`, which `compute_steps` uses for a speed of 0.
         """
         speeds = torch.zeros(len(self.start))  # pixels per unit of each coordinate
-        coordinates: list[int] = []
-        for group in groups:
-            # "adjoint" and "image" are valid only for groups that move no outline, so
-            # that any other valid estimator is a sign of motion.
-            may_move = {*group.valid} - {"adjoint", "image"}
-            if may_move and group.size <= MAX_MEASURED_SIZE:
-                coordinates += range(group.begin, group.begin + group.size)
+        coordinates = _list_measured_coordinates(groups)
         if motion is not None and coordinates:
             speeds = motion.measure_speeds(
                 lambda u: self.scene.input_assembler(self.space.inputs(u)),
@@ -954,18 +985,14 @@ class Renderer:
         generator = torch.Generator().manual_seed(0)
         noise = torch.rand(self.start.shape, generator=generator)
         # The point is half way from the start to the center, with some noise: at
-        # borders and special values a derivative may be zero by chance. The random
-        # weights keep the derivatives of an input's entries from cancelling in the sum.
+        # borders and special values a derivative may be zero by chance.
         u = (0.5 * self.start + 0.25 + 0.1 * (noise - 0.5)).requires_grad_()
         with torch.enable_grad():
             inputs = self.scene.input_assembler(self.space.inputs(u))
             for name, tensor in inputs.items():
                 if not tensor.requires_grad:
                     continue
-                weights = torch.rand(tensor.shape, generator=generator)
-                gradient: Tensor | None = torch.autograd.grad(
-                    (tensor * weights).sum(), u, retain_graph=True, allow_unused=True
-                )[0]
+                gradient = _differentiate_weighted_sum(tensor, u, generator)
                 if gradient is None:
                     continue
                 for group in groups:
@@ -984,6 +1011,93 @@ def _get_camera_pose_and_center(description: SceneDescription) -> tuple[Tensor, 
     pose = camera_to_world(description)
     center = compute_center(description)
     return torch.from_numpy(pose).float(), torch.from_numpy(center).float()
+
+
+def _check_in_unit_box(u: Tensor) -> None:
+    """Check that all numbers of a configuration are in [0, 1].
+
+    Raises:
+        InputError: one is not, or is NaN.
+    """
+    # An empty configuration has no smallest number. NaN fails both comparisons.
+    is_in_range = True
+    if u.numel():
+        smallest, largest = torch.aminmax(u.detach())
+        is_in_range = bool((smallest >= 0.0) & (largest <= 1.0))
+    if not is_in_range:
+        raise InputError(
+            "render: expected every entry of u in [0, 1]; project u "
+            "before you render it"
+        )
+
+
+def _list_measured_coordinates(groups: Sequence[Group]) -> list[int]:
+    """Return the coordinates whose motion of outlines is measured.
+
+    Groups of more than `MAX_MEASURED_SIZE` coordinates are left out.
+    """
+    coordinates: list[int] = []
+    for group in groups:
+        # "adjoint" and "image" are valid only for groups that move no outline, so
+        # that any other valid estimator is a sign of motion.
+        may_move = {*group.valid} - {"adjoint", "image"}
+        if may_move and group.size <= MAX_MEASURED_SIZE:
+            coordinates += range(group.begin, group.begin + group.size)
+    return coordinates
+
+
+def _differentiate_weighted_sum(
+    tensor: Tensor, u: Tensor, generator: torch.Generator
+) -> Tensor | None:
+    """Return the derivative (d,) of a weighted sum of a tensor by u; None without one.
+
+    The random weights keep the derivatives of the entries from cancelling in the sum.
+
+    Args:
+        tensor: tensor with a graph.
+        u: (d,) configuration.
+        generator: samples the weights.
+    """
+    weights = torch.rand(tensor.shape, generator=generator)
+    gradient: Tensor | None = torch.autograd.grad(
+        (tensor * weights).sum(), u, retain_graph=True, allow_unused=True
+    )[0]
+    return gradient
+
+
+def _remove_hidden_surfaces(
+    surfaces: Surfaces, front: Tensor, subdivision: int
+) -> None:
+    """Set the ids of surfaces behind something of a photograph to 0, in place.
+
+    Where something in front hides most of a pixel, no surface of the scene is visible.
+
+    Args:
+        surfaces: surfaces at (subdivision H, subdivision W) points.
+        front: (H, W, 2) hidden fractions of the object and of the ground.
+        subdivision: number of rows and columns of points in a pixel.
+    """
+    is_hidden = front[..., 0] > 0.5
+    for dim in (0, 1):  # a pixel's value for all of its points
+        is_hidden = is_hidden.repeat_interleave(subdivision, dim)
+    surfaces.id[is_hidden] = 0  # no surface; depths stay
+
+
+def _add_photograph_noise(
+    image: Tensor, coverage: Tensor, inputs: Mapping[str, Tensor]
+) -> Tensor:
+    """Add noise to an image where the object is visible.
+
+    The photograph around it has its own noise.
+
+    Args:
+        image: (H, W, 3) sRGB.
+        coverage: (H, W, 1) of the scene's surfaces.
+        inputs: scene inputs with the noise.
+    """
+    if "backdrop.front" in inputs:
+        coverage = coverage * (1.0 - inputs["backdrop.front"][..., :1])
+    return (image + coverage * inputs["backdrop.noise"]).clamp(0.0, 1.0)
 
 
 def _select_scene_inputs(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -1052,34 +1166,21 @@ class _Radiance(torch.autograd.Function):
         ctx.save_for_backward(*tensors)
         inputs = dict(zip(names, tensors, strict=True))
         noise_seed = seeds.derive_seed(renderer.root_seed, "primal", seed)
-        guides: Tensor | None = None
         # another program, which also denoises
         if renderer._external_render is not None:
-            rendered = renderer._external_render(inputs, noise_seed, spp)
+            images: Sequence[Tensor] = [
+                renderer._external_render(inputs, noise_seed, spp)
+            ]
         else:
             image_seeds = {"hidden" if hide else "path": noise_seed}
             if denoised and renderer.formation.denoiser == "oidn":
                 guide_seed = seeds.derive_seed(renderer.root_seed, "guides", seed)
                 image_seeds["guides"] = guide_seed
-            scene: MitsubaScene | SharedPaths = renderer.scene
-            # Shared paths are stored for full images only.
-            if renderer.shared_paths is not None and ctx.window is None:
-                scene = renderer.shared_paths
-            with renderer.scene.limit_window(ctx.window):
-                images = scene.render_images(inputs, image_seeds, spp)
             # in the order of `image_seeds`
-            rendered = images[0]
-            if "guides" in image_seeds:
-                guides = images[1]
-        rendered = renderer.replace_non_finite(rendered)
-        if guides is not None:
-            rendered = denoise_image(
-                rendered,
-                albedo=guides[..., :3],
-                normal=guides[..., 3:],
-                plane_radiance=renderer.scene.plane_radiance if hide else None,
-                quick=renderer.formation.quick,
-            )
+            images = _trace_images(renderer, inputs, image_seeds, spp)
+        rendered = renderer.replace_non_finite(images[0])
+        if len(images) > 1:
+            rendered = _denoise_with_guides(renderer, rendered, images[1], hide)
         renderer.n_renders += 1
         return rendered
 
@@ -1103,31 +1204,110 @@ class _Radiance(torch.autograd.Function):
         material_names = [name for name in inputs if name in by_material]
         interior_names = [name for name in inputs if name in by_interior]
         if material_names:
-            # The result has the vertices and the normals of each mesh, and both are
-            # used. Only the radiance is differentiated, not further channels.
-            meshes = sorted({name.rpartition(".")[0] for name in material_names})
-            gradient_of_input |= renderer.scene.render_material_adjoint(
-                inputs, cotangent[..., :3], noise_seed, ctx.spp, meshes=meshes
+            gradient_of_input |= _render_material_gradients(
+                ctx, inputs, cotangent, noise_seed, material_names
             )
-            renderer.n_gradients += 1
         if interior_names:
-            method = "hidden" if ctx.hide else "path"
-            with renderer.scene.limit_window(ctx.window):
-                gradient_of_input |= renderer.scene.render_adjoint(
-                    inputs,
-                    cotangent,
-                    noise_seed,
-                    ctx.spp,
-                    wrt=interior_names,
-                    method=method,
-                )
-            renderer.n_gradients += 1
+            gradient_of_input |= _render_interior_gradients(
+                ctx, inputs, cotangent, noise_seed, interior_names
+            )
         for name, gradient in gradient_of_input.items():
             gradient_of_input[name] = renderer.replace_non_finite(gradient)
         # The six arguments of `forward` between `ctx` and the tensors have no
         # gradients.
         no_gradients = (None,) * 6
         return (*no_gradients, *map(gradient_of_input.get, ctx.names))
+
+
+def _trace_images(
+    renderer: Renderer,
+    inputs: Mapping[str, Tensor],
+    image_seeds: Mapping[str, int],
+    spp: int,
+) -> Sequence[Tensor]:
+    """Trace images of a scene, in the window of the renderer's crop if it has one.
+
+    Args:
+        renderer: renderer of the scene.
+        inputs: inputs of the scene.
+        image_seeds: seed of each image by its kind, such as "path".
+        spp: samples per pixel.
+    """
+    scene: MitsubaScene | SharedPaths = renderer.scene
+    # Shared paths are stored for full images only.
+    if renderer.shared_paths is not None and renderer.window is None:
+        scene = renderer.shared_paths
+    with renderer.scene.limit_window(renderer.window):
+        return scene.render_images(inputs, image_seeds, spp)
+
+
+def _denoise_with_guides(
+    renderer: Renderer, rendered: Tensor, guides: Tensor, hide: bool
+) -> Tensor:
+    """Return denoised radiance.
+
+    Args:
+        renderer: renderer of the scene.
+        rendered: (h, w, C) radiance.
+        guides: (h, w, 6) albedo and normals.
+        hide: whether the environment is hidden behind a backdrop.
+    """
+    return denoise_image(
+        rendered,
+        albedo=guides[..., :3],
+        normal=guides[..., 3:],
+        plane_radiance=renderer.scene.plane_radiance if hide else None,
+        quick=renderer.formation.quick,
+    )
+
+
+def _render_material_gradients(
+    ctx: Any,
+    inputs: dict[str, Tensor],
+    cotangent: Tensor,
+    noise_seed: int,
+    names: Sequence[str],
+) -> dict[str, Tensor]:
+    """Return the gradients of inputs of meshes by the material form; one adjoint render.
+
+    The result has the vertices and the normals of each mesh, and both are used.
+
+    Args:
+        ctx: autograd's context of `_Radiance`.
+        inputs: inputs of the scene.
+        cotangent: (h, w, C) derivative of a loss by the radiance.
+        noise_seed: seed of the noise.
+        names: names of the inputs.
+    """
+    renderer: Renderer = ctx.renderer
+    meshes = sorted({name.rpartition(".")[0] for name in names})
+    # Only the radiance is differentiated, not further channels.
+    gradient_of_input = renderer.scene.render_material_adjoint(
+        inputs, cotangent[..., :3], noise_seed, ctx.spp, meshes=meshes
+    )
+    renderer.n_gradients += 1
+    return gradient_of_input
+
+
+def _render_interior_gradients(
+    ctx: Any,
+    inputs: dict[str, Tensor],
+    cotangent: Tensor,
+    noise_seed: int,
+    names: Sequence[str],
+) -> dict[str, Tensor]:
+    """Return the gradients of inputs by the interior adjoint; one adjoint render.
+
+    The arguments are those of `_render_material_gradients`.
+    """
+    renderer: Renderer = ctx.renderer
+    method = "hidden" if ctx.hide else "path"
+    with renderer.scene.limit_window(ctx.window):
+        gradient_of_input = renderer.scene.render_adjoint(
+            inputs, cotangent, noise_seed, ctx.spp, wrt=names, method=method
+        )
+    renderer.n_gradients += 1
+    return gradient_of_input
 
 
 def _select_reached_inputs(renderer: Renderer, estimator: str) -> frozenset[str]:
