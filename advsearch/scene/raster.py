@@ -159,12 +159,7 @@ def _find_column_span(
         (N,) smallest and (N,) largest column; (inf, -inf) where nothing is left.
     """
     x = corners[..., 0]
-    y = corners[..., 1]
-    strip_start = row[:, None]
-    strip_end = strip_start + 1
-    is_in_strip = (y >= strip_start - PIXEL_TOLERANCE) & (
-        y <= strip_end + PIXEL_TOLERANCE
-    )
+    is_in_strip = _are_in_strips(corners[..., 1], row)
     left = np.where(is_in_strip, x, np.inf).min(axis=1)
     right = np.where(is_in_strip, x, -np.inf).max(axis=1)
     for border_row in (row, row + 1):
@@ -174,6 +169,19 @@ def _find_column_span(
         left = np.where(crosses, np.minimum(left, first_column), left)
         right = np.where(crosses, np.maximum(right, last_column), right)
     return left, right
+
+
+def _are_in_strips(y: Float64Array, row: IntArray) -> BoolArray:
+    """Return whether corners (N, 3) are between the row (N,) of a strip and the next.
+
+    Args:
+        y: rows of the corners.
+        row: first row of each strip.
+    """
+    strip_start = row[:, None]
+    strip_end = strip_start + 1
+    is_after_start = y >= strip_start - PIXEL_TOLERANCE
+    return np.asarray(is_after_start & (y <= strip_end + PIXEL_TOLERANCE))
 
 
 def compute_barycentric(
@@ -394,6 +402,20 @@ def rasterize_charts(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
     face_map[row, column] = face
     weight_map[row, column] = weights
     is_covered[row, column] = True
+    return _fill_charts(mesh, face_map, weight_map, is_covered)
+
+
+def _fill_charts(
+    mesh: Mesh, face_map: IntArray, weight_map: Float64Array, is_covered: BoolArray
+) -> Charts:
+    """Return charts whose texels outside have the values of the nearest covered texel.
+
+    Args:
+        mesh: mesh with texture coordinates.
+        face_map: (h, w) face of each covered texel.
+        weight_map: (h, w, 3) barycentric weights of each covered texel.
+        is_covered: (h, w) whether a texel is covered.
+    """
     # A covered texel is its own nearest one, at the distance 0.
     distance, nearest_indices = ndimage.distance_transform_edt(
         ~is_covered, return_indices=True
@@ -456,17 +478,12 @@ def look_up_texture(
     column1 = ((left + 1) % width).astype(np.int64)
     row0 = (top % height).astype(np.int64)
     row1 = ((top + 1) % height).astype(np.int64)
-    upper = (
-        texels[row0, column0] * (1 - column_fraction)
-        + texels[row0, column1] * column_fraction
-    )
-    lower = (
-        texels[row1, column0] * (1 - column_fraction)
-        + texels[row1, column1] * column_fraction
-    )
-    return np.asarray(
-        upper * (1 - row_fraction) + lower * row_fraction, dtype=np.float32
-    )
+    upper_left = texels[row0, column0] * (1 - column_fraction)
+    upper = upper_left + texels[row0, column1] * column_fraction
+    lower_left = texels[row1, column0] * (1 - column_fraction)
+    lower = lower_left + texels[row1, column1] * column_fraction
+    mean = upper * (1 - row_fraction) + lower * row_fraction
+    return np.asarray(mean, dtype=np.float32)
 
 
 class MeshSurface:
@@ -477,31 +494,12 @@ class MeshSurface:
     """
 
     def __init__(self, mesh: Mesh) -> None:
-        """Compute boxes and normals of the faces, and which faces are neighbors.
-
-        Faces are neighbors if they share an edge. Edges are compared by the positions
-        of their ends: at a UV seam the faces on both sides have different vertices at
-        the same positions.
-        """
+        """Compute boxes and normals of the faces, and which faces are neighbors."""
         self._corners = mesh.vertices[mesh.faces].astype(np.float64)
         self.normals = _compute_face_normals(mesh)
         self._lower = self._corners.min(axis=1)
         self._upper = self._corners.max(axis=1)
-        # (F, 3) corners of the faces, with one index for all vertices at one position
-        point_of_vertex = weld_vertices(mesh)[0]
-        corners = point_of_vertex[mesh.faces]
-        # (3 F, 2) edges in three blocks, each with one edge of all faces
-        edges = np.concatenate(
-            [corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]
-        )
-        # Sorted by their ends, equal edges follow one another: their faces are
-        # neighbors.
-        edges = np.sort(edges, axis=1)
-        order = np.lexsort((edges[:, 1], edges[:, 0]))
-        is_same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
-        face = order % len(mesh.faces)  # each block of edges has one edge of every face
-        # (E, 2) pairs of faces
-        self._neighbours = np.stack([face[:-1][is_same], face[1:][is_same]], axis=1)
+        self._neighbours = _find_neighboring_faces(mesh)  # (E, 2) pairs of faces
 
     def find_hit(
         self, origin: Float64Array, direction: Float64Array
@@ -591,6 +589,25 @@ class MeshSurface:
         left_face, right_face = self._neighbours[is_pair_inside].T
         component = find_components(len(is_inside), left_face, right_face)
         return np.asarray(is_inside & (component == component[face]))
+
+
+def _find_neighboring_faces(mesh: Mesh) -> IntArray:
+    """Return the pairs (E, 2) of faces that share an edge.
+
+    Edges are compared by the positions of their ends: at a UV seam the faces on both
+    sides have different vertices at the same positions.
+    """
+    # (F, 3) corners of the faces, with one index for all vertices at one position
+    point_of_vertex = weld_vertices(mesh)[0]
+    corners = point_of_vertex[mesh.faces]
+    # (3 F, 2) edges in three blocks, each with one edge of all faces
+    edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+    # Sorted by their ends, equal edges follow one another: their faces are neighbors.
+    edges = np.sort(edges, axis=1)
+    order = np.lexsort((edges[:, 1], edges[:, 0]))
+    is_same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
+    face = order % len(mesh.faces)  # each block of edges has one edge of every face
+    return np.stack([face[:-1][is_same], face[1:][is_same]], axis=1)
 
 
 def weld_vertices(mesh: Mesh) -> tuple[IntArray, int]:
