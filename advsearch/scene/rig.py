@@ -100,13 +100,9 @@ class RigCamera:
         # left, y up): `AXES` converts both sides.
         mount_pose = torch.from_numpy(AXES @ self.pose @ AXES).float()
         mount_pose[:3, 3] /= unit_metres
-        orbit_rotation = torch.eye(4)
-        orbit_rotation[:3, :3] = torch.from_numpy(make_rotation(self.azimuth, 0.0, 0.0))
-        # With the shift c - R c, the rotation leaves the center c where it is.
-        orbit_rotation[:3, 3] = center - orbit_rotation[:3, :3] @ center
         first_to_world = inputs.get("camera.to_world", first_pose)
         # from the right: from the mount to the first camera, to the world, and around
-        to_world = orbit_rotation @ first_to_world @ mount_pose
+        to_world = self._compute_orbit_rotation(center) @ first_to_world @ mount_pose
         camera_inputs = {**inputs, "camera.to_world": to_world}
         if self.fov is not None:
             camera_inputs["camera.fov"] = torch.tensor([self.fov])
@@ -115,6 +111,14 @@ class RigCamera:
                 self.camera_model.intrinsics, dtype=torch.float32
             )
         return camera_inputs
+
+    def _compute_orbit_rotation(self, center: Tensor) -> Tensor:
+        """Return the rotation (4, 4) about the vertical through a center by the azimuth."""
+        orbit_rotation = torch.eye(4)
+        orbit_rotation[:3, :3] = torch.from_numpy(make_rotation(self.azimuth, 0.0, 0.0))
+        # With the shift c - R c, the rotation leaves the center c where it is.
+        orbit_rotation[:3, 3] = center - orbit_rotation[:3, :3] @ center
+        return orbit_rotation
 
 
 def read_rig(spec: str) -> tuple[RigCamera, ...]:
@@ -145,6 +149,15 @@ def read_rig(spec: str) -> tuple[RigCamera, ...]:
     has_rig_format = Path(path).suffix.lower() in (".yaml", ".yml")
     if names_single_camera or not has_rig_format:
         return ()
+    return _read_yaml_rig(path)
+
+
+def _read_yaml_rig(path: str) -> tuple[RigCamera, ...]:
+    """Read a rig in our own format, or a camchain; empty if the file has no rig.
+
+    Raises:
+        FileFormatError: it is a rig that cannot be used.
+    """
     try:
         data = parse_yaml(read_text(Path(path), "a camera file", MAX_YAML_BYTES))
     except (OSError, ValueError):
@@ -349,20 +362,45 @@ def _read_entry(spec: str, index: int, entry: Any) -> RigCamera:
     (orbit_angle,) = _parse_numbers(
         where, "around", [entry.get("around", 0.0)], 1, MAX_TURN
     )
-    fov = None
-    if "fov" in entry:
-        (fov,) = _parse_numbers(where, "fov", [entry["fov"]], 1, MAX_FOV)
-        if fov < MIN_FOV:
-            raise FileFormatError(
-                f"{where}: fov: expected {MIN_FOV:g} to {MAX_FOV:g} degrees, got "
-                f"{fov:g}"
-            )
+    fov = _read_entry_fov(where, entry["fov"]) if "fov" in entry else None
+    delay = _read_entry_delay(where, entry)
+    return RigCamera(name=name, pose=pose, azimuth=orbit_angle, fov=fov, delay=delay)
+
+
+def _read_entry_fov(where: str, value: Any) -> float:
+    """Return the field of view of an entry of our own format, in degrees.
+
+    Args:
+        where: file and camera, for messages.
+        value: the value of `fov`.
+
+    Raises:
+        FileFormatError: it is out of range.
+    """
+    (fov,) = _parse_numbers(where, "fov", [value], 1, MAX_FOV)
+    if fov < MIN_FOV:
+        raise FileFormatError(
+            f"{where}: fov: expected {MIN_FOV:g} to {MAX_FOV:g} degrees, got {fov:g}"
+        )
+    return fov
+
+
+def _read_entry_delay(where: str, entry: Mapping[str, Any]) -> float:
+    """Return the delay of an entry of our own format, in seconds; 0 if it has none.
+
+    Args:
+        where: file and camera, for messages.
+        entry: the entry.
+
+    Raises:
+        FileFormatError: it is out of range.
+    """
     (delay,) = _parse_numbers(where, "later", [entry.get("later", 0.0)], 1, MAX_DELAY)
     if delay < 0.0:
         raise FileFormatError(
             f"{where}: later: expected 0 to {MAX_DELAY:g} seconds, got {delay:g}"
         )
-    return RigCamera(name=name, pose=pose, azimuth=orbit_angle, fov=fov, delay=delay)
+    return delay
 
 
 def _read_entry_pose(where: str, entry: Mapping[str, Any]) -> Float64Array:
@@ -405,20 +443,21 @@ def _parse_numbers(
     Raises:
         FileFormatError: it is no such list.
     """
-    is_valid = (
-        isinstance(value, list)
-        and len(value) == count
-        and all(
-            type(x) in (int, float) and math.isfinite(x) and abs(x) <= limit
-            for x in value
-        )
-    )
-    if not is_valid:
+    has_right_length = isinstance(value, list) and len(value) == count
+    if not has_right_length or not all(_is_within_limit(x, limit) for x in value):
         raise FileFormatError(
             f"{where}: {key}: expected {count} numbers up to {limit:g}, got "
             f"{str(value)[:80]!r}"
         )
     return list(map(float, value))
+
+
+def _is_within_limit(value: Any, limit: float) -> bool:
+    """Return whether a value is a finite number whose absolute value is within a limit.
+
+    Booleans are no numbers.
+    """
+    return type(value) in (int, float) and math.isfinite(value) and abs(value) <= limit
 
 
 def _to_rows(value: Any) -> list[list[Any]]:
@@ -451,15 +490,29 @@ def _read_camchain(spec: str, data: Mapping[str, Any]) -> tuple[RigCamera, ...]:
     has_extrinsics = all(KALIBR_TRANSFORM in cameras[name] for name in names[1:])
     if not 2 <= len(names) <= MAX_CAMERAS or not has_extrinsics:
         return ()
-    # Each transform leads from the previous camera's coordinates to the camera's.
-    poses = [np.eye(4)]
+    poses = _chain_poses(spec, names, cameras)
+    models = [read_camera(f"{spec}#{name}") for name in names]
+    return _make_mounts(spec, names, poses, models)
+
+
+def _chain_poses(
+    spec: str, names: Sequence[str], cameras: Mapping[str, Mapping[str, Any]]
+) -> list[Float64Array]:
+    """Return the poses (4, 4) of a camchain's cameras relative to the first.
+
+    Args:
+        spec: the file, for messages.
+        names: names of the cameras in their order.
+        cameras: their entries by name. Each but the first has a transform, which leads
+            from the previous camera's coordinates to the camera's.
+    """
+    poses: list[Float64Array] = [np.eye(4)]
     for name in names[1:]:
         from_previous = _parse_rigid(
             f"{spec}: {name}", KALIBR_TRANSFORM, cameras[name][KALIBR_TRANSFORM]
         )
         poses.append(poses[-1] @ np.linalg.inv(from_previous))
-    models = [read_camera(f"{spec}#{name}") for name in names]
-    return _make_mounts(spec, names, poses, models)
+    return poses
 
 
 def _read_transforms(path: str, frame_names: str) -> tuple[RigCamera, ...]:
@@ -552,13 +605,8 @@ def _read_applied_scale(path: str, data: Mapping[str, Any]) -> float:
     """
     scale = 1.0
     if data.get("applied_scale") is not None:
-        (scale,) = _parse_numbers(
-            path,
-            "applied_scale",
-            [data["applied_scale"]],
-            count=1,
-            limit=1.0 / MIN_SCALE,
-        )
+        values = [data["applied_scale"]]
+        (scale,) = _parse_numbers(path, "applied_scale", values, 1, 1.0 / MIN_SCALE)
     if data.get("applied_transform") is not None:
         scale *= _measure_scale(path, data["applied_transform"])
     if not MIN_SCALE <= scale <= 1.0 / MIN_SCALE:
@@ -651,17 +699,25 @@ def _parse_image(where: str, words: Sequence[str]) -> Float64Array:
         numbers = list(map(float, words[1:8]))
     except ValueError:
         numbers = []
-    w, x, y, z, *shift = _parse_numbers(where, "pose", numbers, 7, MAX_DISTANCE)
+    *quaternion, tx, ty, tz = _parse_numbers(where, "pose", numbers, 7, MAX_DISTANCE)
+    rotation = _make_unit_rotation(where, quaternion)
+    # inverted, since the file has the map from the world to the camera
+    return np.asarray(np.linalg.inv(make_pose(rotation, [tx, ty, tz])), np.float64)
+
+
+def _make_unit_rotation(where: str, quaternion: Sequence[float]) -> Float64Array:
+    """Return the rotation (3, 3) of a quaternion w, x, y, z.
+
+    Raises FileFormatError: it does not have the length 1. `where` names it.
+    """
+    w, x, y, z = quaternion
     length = math.sqrt(w * w + x * x + y * y + z * z)
     if not 0.99 < length < 1.01:  # it is written with few digits
         raise FileFormatError(
             f"{where}: expected a quaternion of length 1, got one of {length:.3g}"
         )
-    rotation = np.reshape(
-        compute_rotation_entries(x / length, y / length, z / length, w / length), (3, 3)
-    )
-    # inverted, since the file has the map from the world to the camera
-    return np.asarray(np.linalg.inv(make_pose(rotation, shift)), np.float64)
+    entries = compute_rotation_entries(x / length, y / length, z / length, w / length)
+    return np.reshape(entries, (3, 3))
 
 
 def _parse_names(path: str, listing_text: str, known_names: Sequence[str]) -> list[str]:
@@ -681,9 +737,8 @@ def _parse_names(path: str, listing_text: str, known_names: Sequence[str]) -> li
         )
     unknown = [name for name in names if name not in known_names]
     if unknown:
-        listing = ", ".join(known_names[:8])
-        if len(known_names) > 8:
-            listing += ", ..."
+        more = ", ..." if len(known_names) > 8 else ""
+        listing = ", ".join(known_names[:8]) + more
         raise FileFormatError(
             f"{path}: expected some of its cameras {listing}, got {unknown[0][:40]!r}"
         )
