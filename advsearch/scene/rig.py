@@ -457,7 +457,8 @@ def _is_within_limit(value: Any, limit: float) -> bool:
 
     Booleans are no numbers.
     """
-    return type(value) in (int, float) and math.isfinite(value) and abs(value) <= limit
+    is_finite = type(value) in (int, float) and math.isfinite(value)
+    return is_finite and bool(abs(value) <= limit)
 
 
 def _to_rows(value: Any) -> list[list[Any]]:
