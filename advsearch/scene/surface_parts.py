@@ -81,17 +81,28 @@ def unwrap(soup: TriangleSoup, chart_group: IntArray | None = None) -> TriangleS
     has_too_many_patches = int(patch.max()) >= _MAX_PATCHES  # counted from 0
     if has_too_many_patches:
         return replace(soup, uvs=_make_grid_uvs(len(soup.faces)))
+    uvs = _unwrap_patches(soup, patch)
+    # An interpolated look-up near a border of the square also reads texels at the
+    # opposite border. xatlas leaves no gap there, so that the charts are shrunk: by
+    # half a gap on each side.
+    margin = 0.5 * ATLAS_PADDING / ATLAS_SIZE
+    return replace(soup, uvs=margin + (1.0 - 2.0 * margin) * np.clip(uvs, 0.0, 1.0))
+
+
+def _unwrap_patches(soup: TriangleSoup, patch: IntArray) -> Float64Array:
+    """Return texture coordinates (F, 3, 2) of faces, patch by patch, from xatlas.
+
+    Args:
+        soup: the faces.
+        patch: (F,) the patch of each face.
+    """
     groups = group_indices(patch)
     atlas = _generate_atlas(soup, groups)
     uvs = np.empty((len(soup.faces), 3, 2))
     for index, group in enumerate(groups):
         _vertices, corners, atlas_uvs = atlas[index]
         uvs[group] = np.asarray(atlas_uvs, dtype=np.float64)[np.asarray(corners)]
-    # An interpolated look-up near a border of the square also reads texels at the
-    # opposite border. xatlas leaves no gap there, so that the charts are shrunk: by
-    # half a gap on each side.
-    margin = 0.5 * ATLAS_PADDING / ATLAS_SIZE
-    return replace(soup, uvs=margin + (1.0 - 2.0 * margin) * np.clip(uvs, 0.0, 1.0))
+    return uvs
 
 
 def _make_grid_uvs(count: int) -> Float64Array:
@@ -178,13 +189,10 @@ def _find_patches(soup: TriangleSoup) -> IntArray:
     left_corner, right_corner, _ = find_shared_edges(soup.faces)
     face = left_corner // 3
     neighbour = right_corner // 3
-    is_flush = (normals[face] * normals[neighbour]).sum(axis=1) > _MIN_FLUSH_COSINE
-    plane = find_components(count, face[is_flush], neighbour[is_flush])
     patch = np.zeros(count, dtype=np.int64)
     # whether both faces of an edge stay in one patch
     is_same = np.ones(len(face), np.bool_)
-    # a large mesh, or a curved surface that would count as one plane
-    if count > _FACES_PER_ATLAS or not _are_straight(normals, plane):
+    if _has_to_be_cut(normals, face, neighbour):
         direction = _find_directions(normals, face, neighbour)
         is_same = direction[face] == direction[neighbour]
         patch = find_components(count, face[is_same], neighbour[is_same])
@@ -193,6 +201,20 @@ def _find_patches(soup: TriangleSoup) -> IntArray:
         return patch
     is_same &= piece[face] == piece[neighbour]
     return find_components(count, face[is_same], neighbour[is_same])
+
+
+def _has_to_be_cut(normals: Float64Array, face: IntArray, neighbour: IntArray) -> bool:
+    """Return whether a mesh is large, or has a curved surface that counts as one plane.
+
+    Args:
+        normals: (F, 3) unit normals of the faces.
+        face: (E,) index of one face of each shared edge.
+        neighbour: (E,) index of the other face.
+    """
+    count = len(normals)
+    is_flush = (normals[face] * normals[neighbour]).sum(axis=1) > _MIN_FLUSH_COSINE
+    plane = find_components(count, face[is_flush], neighbour[is_flush])
+    return count > _FACES_PER_ATLAS or not _are_straight(normals, plane)
 
 
 def _find_directions(
@@ -344,17 +366,12 @@ class SurfaceParts:
         self.n_parts = MAP_SIZE * MAP_SIZE + len(faces)
         self.is_covered = charts.is_covered
         self.face_of_part = np.concatenate([charts.face_index.reshape(-1), faces])
+        cell_centers = charts.compute_positions().reshape(-1, 3)
         face_centers = mesh.vertices[mesh.faces[faces]].mean(axis=1)
-        centers = np.concatenate(
-            [charts.compute_positions().reshape(-1, 3), face_centers]
-        )
+        centers = np.concatenate([cell_centers, face_centers])
         self.centers = centers.astype(np.float64)
-        # the middle of each cell; row 0 is at v = 1
-        row, column = np.divmod(np.arange(MAP_SIZE * MAP_SIZE), MAP_SIZE)
-        cell_uvs = np.stack(
-            [(column + 0.5) / MAP_SIZE, 1.0 - (row + 0.5) / MAP_SIZE], axis=1
-        )
-        self.center_uvs = np.concatenate([cell_uvs, self.face_uvs[faces].mean(axis=1)])
+        face_center_uvs = self.face_uvs[faces].mean(axis=1)
+        self.center_uvs = np.concatenate([_make_cell_uvs(), face_center_uvs])
 
     @property
     def part_slices(self) -> dict[str, slice]:
@@ -390,6 +407,12 @@ class SurfaceParts:
         column_and_row = np.floor(np.stack([map_u, 1 - map_v]) * MAP_SIZE)
         column, row = np.clip(column_and_row, 0, MAP_SIZE - 1).astype(np.int64)
         return np.asarray(row * MAP_SIZE + column)
+
+
+def _make_cell_uvs() -> Float64Array:
+    """Return u and v (cells, 2) of the middle of each cell; row 0 is at v = 1."""
+    row, column = np.divmod(np.arange(MAP_SIZE * MAP_SIZE), MAP_SIZE)
+    return np.stack([(column + 0.5) / MAP_SIZE, 1.0 - (row + 0.5) / MAP_SIZE], axis=1)
 
 
 def _unwrap_mesh(mesh: Mesh) -> Float64Array:
@@ -434,8 +457,7 @@ def _has_unique_uvs(mesh: Mesh, uvs: Float64Array) -> bool:
 
     There are four conditions. The coordinates are in the unit square. Almost all of the
     surface has an area in the texture. The faces cover enough of the square, and hardly
-    any of it twice. The last two are tested on a raster of `_TEST_RASTER_SIZE` pixels a
-    side.
+    any of it twice.
 
     Args:
         mesh: the mesh.
@@ -448,6 +470,17 @@ def _has_unique_uvs(mesh: Mesh, uvs: Float64Array) -> bool:
     is_flat = np.abs(compute_doubled_areas(uvs)) < 1e-12
     if areas[is_flat].sum() > MAX_FLAT_FRACTION * areas.sum():
         return False
+    return _covers_map_once(uvs)
+
+
+def _covers_map_once(uvs: Float64Array) -> bool:
+    """Return whether faces cover enough of the unit square, and hardly any of it twice.
+
+    They are tested on a raster of `_TEST_RASTER_SIZE` pixels a side.
+
+    Args:
+        uvs: (F, 3, 2) texture coordinates of the corners of the faces.
+    """
     # The raster has the center of its first pixel at 0. By the negative tolerance a
     # pixel on the border of two faces is in neither.
     _face, row, column, _weights = rasterize_triangles(
@@ -459,7 +492,5 @@ def _has_unique_uvs(mesh: Mesh, uvs: Float64Array) -> bool:
     # several entries.
     n_covered = len(np.unique(row * _TEST_RASTER_SIZE + column))
     n_repeated = len(row) - n_covered
-    return (
-        n_covered >= MIN_COVERED_FRACTION * _TEST_RASTER_SIZE**2
-        and n_repeated <= MAX_DOUBLED_FRACTION * n_covered
-    )
+    covers_enough = n_covered >= MIN_COVERED_FRACTION * _TEST_RASTER_SIZE**2
+    return covers_enough and n_repeated <= MAX_DOUBLED_FRACTION * n_covered
