@@ -109,17 +109,24 @@ def parse_things(things_spec: str | None) -> tuple[RequestedThing, ...]:
                 f"things: {part}: another thing of the scene is called "
                 f"{thing.name}; choose another name"
             )
-        # car, car-2, car-3: each number replaces the one before. So a name that ends in
-        # "-1", as that of the file "car-1.glb", is followed by "car-2".
-        number = 2
-        while thing.name in used_names:
-            plain_name = thing.name.removesuffix(f"-{number - 1}")
-            thing = replace(thing, name=f"{plain_name}-{number}")
-            number += 1
-        things.append(thing)
+        things.append(replace(thing, name=_find_unused_name(thing.name, used_names)))
     if len(things) > MAX_THINGS:
         raise InputError(f"things: expected at most {MAX_THINGS}, got {len(things)}")
     return tuple(things)
+
+
+def _find_unused_name(name: str, used_names: Sequence[str]) -> str:
+    """Return a name, with a number if it is used: car, car-2, car-3.
+
+    Each number replaces the one before. So a name that ends in "-1", as that of the
+    file "car-1.glb", is followed by "car-2".
+    """
+    number = 2
+    while name in used_names:
+        plain_name = name.removesuffix(f"-{number - 1}")
+        name = f"{plain_name}-{number}"
+        number += 1
+    return name
 
 
 def _parse_thing(part: str) -> RequestedThing:
@@ -132,19 +139,8 @@ def _parse_thing(part: str) -> RequestedThing:
     Raises InputError, UnknownNameError: it is not written so, or a number or an option
     is not valid.
     """
-    object_spec, separator, rest = part.rpartition("@")
-    object_spec = object_spec.strip()
-    # X, Y, and then options such as heading=180
-    words = [word.strip() for word in rest.split(",")]
-    option_words = words[2:]
-    has_position = bool(separator) and len(words) >= 2
-    has_options = all("=" in word for word in option_words)
-    if not (object_spec and has_position and has_options):
-        raise InputError(
-            "things: expected WHAT@X,Y in metres, such as car@12,3.5,heading=180, got "
-            f"{part!r}"
-        )
-    options = _parse_options(part, option_words)
+    object_spec, words = _split_thing(part)
+    options = _parse_options(part, words[2:])
     x = _parse_number(part, "x", words[0], -MAX_DISTANCE, MAX_DISTANCE)
     y = _parse_number(part, "y", words[1], -MAX_DISTANCE, MAX_DISTANCE)
     heading = 0.0
@@ -169,6 +165,25 @@ def _parse_thing(part: str) -> RequestedThing:
         lamps=options.get("lamps", LAMPS_OFF),
         facing=options.get("facing"),
     )
+
+
+def _split_thing(part: str) -> tuple[str, list[str]]:
+    """Split a thing into its object, and the words X, Y and options behind the @.
+
+    Raises InputError: it is not written so.
+    """
+    object_spec, separator, rest = part.rpartition("@")
+    object_spec = object_spec.strip()
+    # X, Y, and then options such as heading=180
+    words = [word.strip() for word in rest.split(",")]
+    has_position = bool(separator) and len(words) >= 2
+    has_options = all("=" in word for word in words[2:])
+    if not (object_spec and has_position and has_options):
+        raise InputError(
+            "things: expected WHAT@X,Y in metres, such as car@12,3.5,heading=180, got "
+            f"{part!r}"
+        )
+    return object_spec, words
 
 
 def _parse_options(part: str, words: Iterable[str]) -> dict[str, str]:
@@ -256,9 +271,6 @@ def _make_thing(
 ) -> tuple[ThingPart, list[str]]:
     """Return a thing that stands in a scene, and remarks on it.
 
-    Remarks are notes on its file, doubts about its size and, if the ground has lanes,
-    that its front was guessed.
-
     Args:
         scene: the scene.
         thing: what the user has requested.
@@ -285,6 +297,24 @@ def _make_thing(
     part = make_mesh_part(name, asset, pose, asset.material)
     # the fields of the mesh, with the label of the thing if it has one
     fields = {**vars(part), "label": thing.label or asset.label}
+    thing_part = ThingPart(
+        **fields, size_in_metres=asset.size_in_metres, lamps=thing.lamps
+    )
+    return thing_part, _list_thing_remarks(scene, thing, asset)
+
+
+def _list_thing_remarks(
+    scene: SceneData, thing: RequestedThing, asset: ObjectAsset
+) -> list[str]:
+    """Return notes on a thing's file, and doubts about its size and its front.
+
+    That its front was guessed matters if the ground has lanes.
+
+    Args:
+        scene: the scene.
+        thing: what the user has requested.
+        asset: the thing's object.
+    """
     remarks = [
         *asset.notes,
         *describe_size_doubts(
@@ -293,9 +323,7 @@ def _make_thing(
     ]
     if asset.front is not None and asset.front.reason and has_lanes(scene):
         remarks.append(asset.front.reason)
-    return ThingPart(
-        **fields, size_in_metres=asset.size_in_metres, lamps=thing.lamps
-    ), remarks
+    return remarks
 
 
 def _list_overlap_remarks(scene: SceneData) -> list[str]:
@@ -437,19 +465,8 @@ def list_camera_remarks(
         scene: the scene.
         eyes: positions (3,) of the cameras in metres, at least one.
     """
-    solid_names = list[str]()
-    for eye in eyes:
-        # Overlap is defined for footprints. So the camera is a tiny square, whose
-        # corners are on the axes. Lengths of the scene are in object sizes.
-        x, y, z = eye / scene.size_in_metres
-        corners = np.array(
-            [(x - EYE_SIZE, y), (x, y - EYE_SIZE), (x + EYE_SIZE, y), (x, y + EYE_SIZE)]
-        )
-        solid = find_overlapping_solid(
-            scene, Footprint(corners, z - EYE_SIZE, z + EYE_SIZE)
-        )
-        if solid is not None:
-            solid_names.append(solid)
+    solids_of_eyes = [_find_solid_at(scene, eye) for eye in eyes]
+    solid_names = [solid for solid in solids_of_eyes if solid is not None]
     if not solid_names:
         return ()
     if len(eyes) == 1:
@@ -463,3 +480,19 @@ def list_camera_remarks(
         f"The camera is inside {solids} of the place in {fraction:.0f} % of the views: "
         "it sees no object from there; narrow where it goes.",
     )
+
+
+def _find_solid_at(scene: SceneData, eye: Float64Array) -> str | None:
+    """Return the solid of the place that a camera is inside; None if it is free.
+
+    Args:
+        scene: the scene.
+        eye: position (3,) of the camera in metres.
+    """
+    # Overlap is defined for footprints. So the camera is a tiny square, whose
+    # corners are on the axes. Lengths of the scene are in object sizes.
+    x, y, z = eye / scene.size_in_metres
+    corners = np.array(
+        [(x - EYE_SIZE, y), (x, y - EYE_SIZE), (x + EYE_SIZE, y), (x, y + EYE_SIZE)]
+    )
+    return find_overlapping_solid(scene, Footprint(corners, z - EYE_SIZE, z + EYE_SIZE))
