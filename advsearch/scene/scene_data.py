@@ -225,7 +225,7 @@ class SceneData:
         return self.object.material.with_values(self.values, "material.")
 
 
-def _move_glasses(meshes: dict[str, MeshPart]) -> dict[str, MeshPart]:
+def _move_glasses(meshes: dict[str, MeshPart]) -> Mapping[str, MeshPart]:
     """Return meshes in which the glass of lamps has the pose of the car.
 
     Args:
