@@ -1166,18 +1166,12 @@ class _Radiance(torch.autograd.Function):
         ctx.save_for_backward(*tensors)
         inputs = dict(zip(names, tensors, strict=True))
         noise_seed = seeds.derive_seed(renderer.root_seed, "primal", seed)
-        # another program, which also denoises
-        if renderer._external_render is not None:
-            images: Sequence[Tensor] = [
-                renderer._external_render(inputs, noise_seed, spp)
-            ]
-        else:
-            image_seeds = {"hidden" if hide else "path": noise_seed}
-            if denoised and renderer.formation.denoiser == "oidn":
-                guide_seed = seeds.derive_seed(renderer.root_seed, "guides", seed)
-                image_seeds["guides"] = guide_seed
-            # in the order of `image_seeds`
-            images = _trace_images(renderer, inputs, image_seeds, spp)
+        image_seeds = {"hidden" if hide else "path": noise_seed}
+        if denoised and renderer.formation.denoiser == "oidn":
+            guide_seed = seeds.derive_seed(renderer.root_seed, "guides", seed)
+            image_seeds["guides"] = guide_seed
+        # in the order of `image_seeds`
+        images = _render_seeded_images(renderer, inputs, image_seeds, spp)
         rendered = renderer.replace_non_finite(images[0])
         if len(images) > 1:
             rendered = _denoise_with_guides(renderer, rendered, images[1], hide)
@@ -1219,20 +1213,26 @@ class _Radiance(torch.autograd.Function):
         return (*no_gradients, *map(gradient_of_input.get, ctx.names))
 
 
-def _trace_images(
+def _render_seeded_images(
     renderer: Renderer,
     inputs: Mapping[str, Tensor],
     image_seeds: Mapping[str, int],
     spp: int,
-) -> Sequence[Tensor]:
-    """Trace images of a scene, in the window of the renderer's crop if it has one.
+) -> list[Tensor]:
+    """Render images of a scene, in the window of the renderer's crop if it has one.
+
+    Another program renders only the radiance, which is the first image, and denoises it
+    itself.
 
     Args:
         renderer: renderer of the scene.
         inputs: inputs of the scene.
-        image_seeds: seed of each image by its kind, such as "path".
+        image_seeds: seed of each image by its kind, such as "path"; radiance first.
         spp: samples per pixel.
     """
+    if renderer._external_render is not None:
+        radiance_seed, *_ = image_seeds.values()
+        return [renderer._external_render(inputs, radiance_seed, spp)]
     scene: MitsubaScene | SharedPaths = renderer.scene
     # Shared paths are stored for full images only.
     if renderer.shared_paths is not None and renderer.window is None:

@@ -443,9 +443,6 @@ class SkeletonRig:
     ) -> tuple[Tensor, dict[int, Tensor]]:
         """Return the poses of nodes and the weights of morph targets in a clip.
 
-        Properties that the clip does not set have their values at rest. A node whose
-        pose is a matrix in the file cannot be animated.
-
         Args:
             clip: the clip.
             seconds: () time since the clip's start.
@@ -453,6 +450,24 @@ class SkeletonRig:
         Returns:
             The matrices (N, 4, 4) of all nodes to their parents; and for each node
             whose weights the clip sets, the weights (T,) of its morph targets.
+        """
+        local_matrices = self._sample_local_matrices(clip, seconds)
+        weights = {
+            track.node: sample_track(track, seconds)
+            for track in clip.tracks
+            if track.path == "weights"
+        }
+        return local_matrices, weights
+
+    def _sample_local_matrices(self, clip: Clip, seconds: Tensor) -> Tensor:
+        """Return the matrices (N, 4, 4) of all nodes to their parents in a clip.
+
+        Properties that the clip does not set have their values at rest. A node whose
+        pose is a matrix in the file cannot be animated.
+
+        Args:
+            clip: the clip.
+            seconds: () time since the clip's start.
         """
         skeleton = self.skeleton
         device = seconds.device
@@ -469,15 +484,9 @@ class SkeletonRig:
         }
         composed = _compose_matrices(**properties)
         is_fixed = torch.from_numpy(skeleton.has_matrix).to(device)
-        local_matrices = torch.where(
+        return torch.where(
             is_fixed[:, None, None], self._local_matrices.to(device), composed
         )
-        weights = {
-            track.node: sample_track(track, seconds)
-            for track in clip.tracks
-            if track.path == "weights"
-        }
-        return local_matrices, weights
 
     def _turn_joints(
         self, local_matrices: Tensor, number_by_name: Mapping[str, Tensor]

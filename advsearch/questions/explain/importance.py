@@ -312,10 +312,7 @@ class ClusteredPredictions:
         )
         cell_group, cell_cluster = np.divmod(cell_id, self.n_clusters)  # (cells,) each
         clusters_per_group = np.bincount(cell_group, minlength=len(group_weight))
-        # The variance inside a group needs two clusters there, and that of the overall
-        # rate more clusters than groups.
-        has_enough_clusters = self.n_clusters >= 2 and self.n_clusters > n_groups
-        if not has_enough_clusters or clusters_per_group[is_used].min() < 2:
+        if not self._has_enough_clusters(n_groups, clusters_per_group[is_used]):
             return math.nan
 
         residual = self._weighted_residual(group, group_weight, is_used)
@@ -331,6 +328,20 @@ class ClusteredPredictions:
         between_clusters = self._between_cluster_variance(cell_cluster, cell_residual)
         excess = (within_groups - between_clusters) / self.variance
         return max(excess, MIN_INFLATION * float(n_groups - 1))
+
+    def _has_enough_clusters(self, n_groups: int, clusters_per_group: IntArray) -> bool:
+        """Return whether the variances of rates can be estimated from clusters.
+
+        That inside a group needs two clusters there, and that of the overall rate more
+        clusters than groups.
+
+        Args:
+            n_groups: number of groups.
+            clusters_per_group: (groups,) number of clusters of each group.
+        """
+        if self.n_clusters < 2 or self.n_clusters <= n_groups:
+            return False
+        return bool(clusters_per_group.min() >= 2)
 
     def _weighted_residual(
         self,

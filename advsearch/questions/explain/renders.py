@@ -363,8 +363,8 @@ class SweepRunner:
         rows = self._find_pair_rows(frames, factor, wrong_value)
         if rows is None:
             return None
-        first_frame = frames[0]
         failure_row, nearest_row = rows
+        first_frame = frames[0]
         return NearestRight(
             values=failure,
             parameter=factor,

@@ -16,6 +16,14 @@ import pandas as pd
 from advsearch.extend import Parameter, SweepConfig, rules, settings, wording
 from advsearch.questions.explain.rows import SCENE_SETTINGS
 
+# Workers and machines of a cluster take longer to start than ten images to render.
+SETTINGS_ALONG: dict[str, Any] = {
+    "samples": None,
+    "keep_pictures": "all",
+    "workers": None,
+    "cluster": None,
+}
+"""Settings of a sweep along one factor."""
 N_VALUES_ALONG = 9
 """Number of values of a factor that are tried to find the nearest right prediction."""
 
@@ -253,14 +261,9 @@ def make_sweep_along(
         config,
         grid=grid,
         controls=select_choices(config, grid),
-        samples=None,
         seed=seed,
-        keep_pictures="all",
         set=set_values,
-        # Workers and machines of a cluster take longer to start than ten images to
-        # render.
-        workers=None,
-        cluster=None,
+        **SETTINGS_ALONG,
         **scene_settings,
     )
 

@@ -386,19 +386,16 @@ class ObjectFamily:
             instance = _sort_by_material(instance)
         rectangles = pack_charts(_scale_charts(instance), self.atlas_size)
         mesh = join_patches(instance.patches, rectangles, self.atlas_size)
-        surface = None
+        surface: dict[str, object] | None = None
         if instance.materials_by_tag:
-            materials = _faces_by_material(instance.patches)
-            mesh = replace(mesh, materials=materials, rig=instance.rig)
-            surface = workbench.library.make_finished_surface(
-                mesh, instance.materials_by_tag, instance.material
-            )
+            mesh, surface = _add_materials(mesh, instance)
+        base_color = paint_atlas(
+            instance.patches, rectangles, instance.paints, self.atlas_size
+        )
         return assets.ObjectAsset(
             name=self.name,
             mesh=mesh,
-            base_color=paint_atlas(
-                instance.patches, rectangles, instance.paints, self.atlas_size
-            ),
+            base_color=base_color,
             material=instance.material,
             label=self.label,
             source=workbench.library.BUNDLED_OBJECT,
@@ -413,6 +410,23 @@ class ObjectFamily:
         vertices = np.concatenate([patch.vertices for patch in instance.patches])
         extent = np.ptp(vertices, axis=0).max()
         return round(float(extent) * self.unit_in_metres, 4)
+
+
+def _add_materials(
+    mesh: assets.Mesh, instance: Instance
+) -> tuple[assets.Mesh, dict[str, object]]:
+    """Return the mesh of an instance with its materials and its rig, and its surface.
+
+    Args:
+        mesh: mesh of the patches of the instance.
+        instance: instance with several materials, whose patches are sorted by material.
+    """
+    materials = _faces_by_material(instance.patches)
+    mesh = replace(mesh, materials=materials, rig=instance.rig)
+    surface = workbench.library.make_finished_surface(
+        mesh, instance.materials_by_tag, instance.material
+    )
+    return mesh, surface
 
 
 def _scale_charts(instance: Instance) -> list[tuple[float, float]]:
