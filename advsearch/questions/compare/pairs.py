@@ -44,8 +44,6 @@ def compare_sides(
     shared_parameters = _find_shared_parameters(first, second)
     # Pairs of one unit, such as the frames of a drive, are not independent.
     unit_of_pair = first.rows["unit"].to_numpy()
-    n_units = len(np.unique(unit_of_pair))
-    has_single_pairs = n_units == len(unit_of_pair)
     # The difference and its interval are also in `count_pairs` below.
     _, _, p_value = statistics.clustered.compare_paired(
         first.is_right, second.is_right, unit_of_pair
@@ -59,7 +57,7 @@ def compare_sides(
     return ComparedPair(
         first=first.name,
         second=second.name,
-        units=None if has_single_pairs else n_units,
+        units=_count_shared_units(unit_of_pair),
         unit=first.rows.attrs["unit name"],
         **count_pairs(first.is_right, second.is_right, unit_of_pair),
         p=p_value,
@@ -67,6 +65,13 @@ def compare_sides(
         parts=parts,
         discordant_pictures=[],
     )
+
+
+def _count_shared_units(unit_of_pair: IntArray) -> int | None:
+    """Return the number of units of pairs (n,); None if each pair is a unit by itself."""
+    n_units = len(np.unique(unit_of_pair))
+    has_single_pairs = n_units == len(unit_of_pair)
+    return None if has_single_pairs else n_units
 
 
 def _find_shared_parameters(first: Side, second: Side) -> list[str]:

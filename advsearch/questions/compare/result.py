@@ -350,10 +350,11 @@ def _make_parameter_tables(pair: ComparedPair) -> Iterator[ResultPart]:
         # An empty `only` shows the table on the page and in a terminal.
         only = "" if title in titles_in_terminal else "page"
         yield ResultPart(title, column_heads=heads, rows=rows, only_medium=only)
-    if len(titles_in_terminal) < len(parts_by_title):
+    n_parameters = len(parts_by_title)
+    if len(titles_in_terminal) < n_parameters:
         remark = (
             "The difference varies most over these; the page has all "
-            f"{len(parts_by_title)} parameters."
+            f"{n_parameters} parameters."
         )
         yield ResultPart(text=[remark], only_medium="text")
 
@@ -468,23 +469,28 @@ def _make_picture_parts(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
         pair: pair of both sides.
     """
     title = f"Only {name} gets right:"
-    text_rows: list[list[str]] = []
-    lines_without_pictures: list[str] = []
-    groups: list[list[views.Picture]] = []
-    for example in pair.discordant_pictures:
-        if example.right != name:
-            continue
-        line = "; ".join([*_make_captions(example, pair), _format_values(example)])
-        text_rows.append([line, *example.pictures])
-        if example.pictures:
-            groups.append(_group_pictures(example, pair))
-        else:
-            lines_without_pictures.append(line)
+    examples = [
+        example for example in pair.discordant_pictures if example.right == name
+    ]
+    text_rows = [
+        [_describe_example(example, pair), *example.pictures] for example in examples
+    ]
+    lines_without_pictures = [
+        _describe_example(example, pair) for example in examples if not example.pictures
+    ]
+    groups = [
+        _group_pictures(example, pair) for example in examples if example.pictures
+    ]
     has_single_images = groups and all(len(group) == 1 for group in groups)
     if has_single_images:
         groups = [[group[0] for group in groups]]
     yield ResultPart(title, rows=text_rows[:MAX_PICTURES], only_medium="text")
     yield ResultPart(title, lines_without_pictures, pictures=groups, only_medium="page")
+
+
+def _describe_example(example: PairPicture, pair: ComparedPair) -> str:
+    """Return what each side predicts for a pair, and the values of its parameters."""
+    return "; ".join([*_make_captions(example, pair), _format_values(example)])
 
 
 def _group_pictures(example: PairPicture, pair: ComparedPair) -> list[views.Picture]:
