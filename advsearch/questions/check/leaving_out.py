@@ -123,10 +123,8 @@ def _make_variants(
     if depth != scene.max_depth:
         variants[SEARCH] = renderer.copy_with(scene.copy_with(max_depth=depth))
     for item in ITEMS:
-        other_items = ALL_ITEMS - {item}
-        variants[item] = renderer.copy_with(
-            scene.copy_with(max_depth=depth, leave_out=other_items)
-        )
+        with_item = scene.copy_with(max_depth=depth, leave_out=ALL_ITEMS - {item})
+        variants[item] = renderer.copy_with(with_item)
     leaves_out_bounces = depth < scene.max_depth
     if leaves_out_bounces:
         variants[BOUNCES] = renderer  # its light paths have their full length

@@ -79,6 +79,8 @@ def _patches(person: Any) -> list[Patch]:
     for number, tag in enumerate(data["tags"]):
         in_chart = slice(first_vertex[number], first_vertex[number + 1])
         width, height = data["sizes"][number][:2]
+        # The paint of a texel depends on its point of the reference body.
+        rest_points = _interpolate_chart(charts[in_chart], reference[in_chart])
         patches.append(
             Patch(
                 tag=str(tag),
@@ -87,10 +89,7 @@ def _patches(person: Any) -> list[Patch]:
                 uvs=charts[in_chart],
                 faces=faces_of_chart[number],
                 size=(float(width), float(height)),
-                # The paint of a texel depends on its point of the reference body.
-                compute_rest_points=_interpolate_chart(
-                    charts[in_chart], reference[in_chart]
-                ),
+                compute_rest_points=rest_points,
             )
         )
     return patches

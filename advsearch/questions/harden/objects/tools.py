@@ -48,21 +48,31 @@ def _claw(
     """
     spread = sampler(0.34, low=0.2, high=0.5)
     t = np.linspace(0.0, 1.0, 14)  # from the root to the tip
-    half_thickness = half_head * (0.72 * (1 - t) + 0.1)
-    half_width = half_head * 0.47 * (1.0 - 0.25 * t)
-    scale = np.stack([half_thickness, half_width], axis=1)
-    section = shapes.rectangle(2.0, 2.0, bevel=0.5, steps=2)
     patches = []
     for side in (-1.0, 1.0):
         # The powers bend the prongs: the tips turn downwards.
         x = 0.25 * half_head - drop * t**1.8
         y = start + length * (t - 0.1 * t**2)
         z = side * half_head * (0.5 + spread * t)
-        curve = np.stack([x, y, z], axis=1)
-        patches += shapes.sweep_section(
-            "head", curve, section, scale, start_axis=(1.0, 0.0, 0.0), has_caps=True
-        )
+        patches += _prong(np.stack([x, y, z], axis=1), half_head)
     return patches
+
+
+def _prong(curve: Array, half_head: float) -> list[Patch]:
+    """Create a prong of a claw along a curve (N, 3), which tapers to its end.
+
+    Args:
+        curve: from the root to the tip.
+        half_head: half the width of the head.
+    """
+    t = np.linspace(0.0, 1.0, len(curve))
+    half_thickness = half_head * (0.72 * (1 - t) + 0.1)
+    half_width = half_head * 0.47 * (1.0 - 0.25 * t)
+    scale = np.stack([half_thickness, half_width], axis=1)
+    section = shapes.rectangle(2.0, 2.0, bevel=0.5, steps=2)
+    return shapes.sweep_section(
+        "head", curve, section, scale, start_axis=(1.0, 0.0, 0.0), has_caps=True
+    )
 
 
 def _points_on_y(*positions: float) -> Array:

@@ -227,17 +227,29 @@ def _ceramic_belt(
         low = sampler(0.5, low=0.3, high=0.7) * height
         # twice the height: up to the top, with some margin for the lip
         return paint_over(glaze, make_range_mask(low, 2 * height, soft=0.1), accent)
+    return _sample_patterned_belt(sampler, kind, height, glaze, second_color)
+
+
+def _sample_patterned_belt(
+    sampler: ParameterSampler, kind: str, height: float, glaze: Paint, color: Array
+) -> Paint:
+    """Sample a belt with a pattern of two colors.
+
+    Args:
+        sampler: samples the proportions and the pale color.
+        kind: "bands", "checks" or "zigzag".
+        height: height of the vessel.
+        glaze: paint of the rest of the vessel.
+        color: the other color of the pattern.
+    """
     if kind == "bands":
-        bands = rings(parse_hex_color(PALE), second_color, period=0.13 * height)
+        bands = rings(parse_hex_color(PALE), color, period=0.13 * height)
         return paint_over(glaze, make_range_mask(0.62 * height, 0.9 * height), bands)
+    pale = sampler.sample_color(PALE)
     if kind == "checks":
-        board = checks(
-            sampler.sample_color(PALE),
-            second_color,
-            cell=sampler(1.4, low=0.9, high=2.2),
-        )
+        board = checks(pale, color, cell=sampler(1.4, low=0.9, high=2.2))
         return paint_over(glaze, make_range_mask(0.25 * height, 0.75 * height), board)
-    chevrons = zigzag(sampler.sample_color(PALE), second_color, cell=2.5)
+    chevrons = zigzag(pale, color, cell=2.5)
     return paint_over(glaze, make_range_mask(0.3 * height, 0.7 * height), chevrons)
 
 
