@@ -992,7 +992,7 @@ class Renderer:
             for name, tensor in inputs.items():
                 if not tensor.requires_grad:
                     continue
-                gradient = _differentiate_weighted_sum(tensor, u, generator)
+                gradient = _differentiate_input_sum(tensor, u, generator)
                 if gradient is None:
                     continue
                 for group in groups:
@@ -1046,7 +1046,7 @@ def _list_measured_coordinates(groups: Sequence[Group]) -> list[int]:
     return coordinates
 
 
-def _differentiate_weighted_sum(
+def _differentiate_input_sum(
     tensor: Tensor, u: Tensor, generator: torch.Generator
 ) -> Tensor | None:
     """Return the derivative (d,) of a weighted sum of a tensor by u; None without one.

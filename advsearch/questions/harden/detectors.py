@@ -502,10 +502,10 @@ class DetectorTrainer(Trainer):
         for module in network.modules():
             if isinstance(module, (_BatchNorm, nn.Dropout)):
                 module.eval()
-        yield partial(self._compute_gradient, network)
+        yield partial(self._compute_batch_gradient, network)
         network.eval()
 
-    def _compute_gradient(
+    def _compute_batch_gradient(
         self, network: nn.Module, batch: Sequence[Example], rng: np.random.Generator
     ) -> None:
         """Compute the gradient of a batch, half of it mirrored at random.

@@ -273,9 +273,9 @@ class ClassifierTrainer(Trainer):
             gradients = GradientComputer(
                 self.student, original_model=self.scene_jobs.model, pool=pool
             )
-            yield partial(self._compute_gradient, gradients)
+            yield partial(self._compute_batch_gradient, gradients)
 
-    def _compute_gradient(
+    def _compute_batch_gradient(
         self,
         gradients: GradientComputer,
         batch: Sequence[Lesson],

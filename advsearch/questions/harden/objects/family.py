@@ -388,7 +388,7 @@ class ObjectFamily:
         mesh = join_patches(instance.patches, rectangles, self.atlas_size)
         surface: dict[str, object] | None = None
         if instance.materials_by_tag:
-            mesh, surface = _add_materials(mesh, instance)
+            mesh, surface = _attach_materials(mesh, instance)
         base_color = paint_atlas(
             instance.patches, rectangles, instance.paints, self.atlas_size
         )
@@ -412,7 +412,7 @@ class ObjectFamily:
         return round(float(extent) * self.unit_in_metres, 4)
 
 
-def _add_materials(
+def _attach_materials(
     mesh: assets.Mesh, instance: Instance
 ) -> tuple[assets.Mesh, dict[str, object]]:
     """Return the mesh of an instance with its materials and its rig, and its surface.
