@@ -716,11 +716,7 @@ class Renderer:
     ) -> Tensor:
         """Render the mean radiance of the moments of u, denoised once.
 
-        Rows of a sensor may be read one after the other, so that each row is exposed
-        during some of the moments only. `row_fractions` (H,) of a moment are its
-        fractions of the exposure of each row, which add up to 1 over the moments. The
-        guides of the denoiser are averaged in the same manner. All moments together
-        count as one render.
+        All moments together count as one render.
 
         Args:
             mount: the camera of a rig; None if the scene has one camera.
@@ -729,8 +725,32 @@ class Renderer:
             spp: samples per pixel of all moments together.
             hide_environment: hide the environment behind a backdrop.
         """
-        is_denoised = self.formation.denoiser == "oidn"
         renders_before = self.n_renders
+        exposed, guides = self._sum_moments(mount, u, seed, spp, hide_environment)
+        # `render_radiance` has counted each moment.
+        self.n_renders = renders_before + 1
+        if self.formation.denoiser != "oidn":
+            return exposed
+        # Denoising is added as a change without a graph: so the derivative is that of
+        # the image before denoising.
+        return exposed + self._compute_denoising_change(exposed, guides)
+
+    def _sum_moments(
+        self,
+        mount: RigCamera | None,
+        u: Tensor,
+        seed: int,
+        spp: int,
+        hide_environment: bool,
+    ) -> tuple[Tensor, Tensor]:
+        """Return the weighted sums over moments of radiance, and of the denoiser's guides.
+
+        Rows of a sensor may be read one after the other, so that each row is exposed
+        during some of the moments only. `row_fractions` (H,) of a moment are its
+        fractions of the exposure of each row, which add up to 1 over the moments. The
+        guides of the denoiser are averaged in the same manner; they are 0 without a
+        denoiser. The arguments are those of `_render_exposure`.
+        """
         # sums over moments, which the first addition makes images
         exposed = torch.zeros(())
         guides = torch.zeros(())
@@ -744,17 +764,11 @@ class Renderer:
             exposed = exposed + row_weights * self.render_radiance(
                 inputs, moment_seed, samples, hide_environment, denoised=False
             )
-            if is_denoised:
+            if self.formation.denoiser == "oidn":
                 with torch.no_grad():
                     moment_guides = self._render_guides(inputs, moment_seed, samples)
                     guides = guides + row_weights * moment_guides
-        # `render_radiance` has counted each moment.
-        self.n_renders = renders_before + 1
-        if not is_denoised:
-            return exposed
-        # Denoising is added as a change without a graph: so the derivative is that of
-        # the image before denoising.
-        return exposed + self._compute_denoising_change(exposed, guides)
+        return exposed, guides
 
     def _render_guides(
         self, inputs: Mapping[str, Tensor], moment_seed: int, spp: int

@@ -165,21 +165,28 @@ def _read_yaml_rig(path: str) -> tuple[RigCamera, ...]:
         return ()
     if not isinstance(data, dict):
         return ()
-    entries = data.get("cameras")
-    if isinstance(entries, list):  # our own format, which has no other entries
-        if set(data) != {"cameras"}:
-            raise FileFormatError(
-                f"{path}: expected `cameras` alone, got "
-                f"{', '.join(map(str, data))[:80]}"
-            )
-        mounts = tuple(
-            _read_entry(path, index, entry) for index, entry in enumerate(entries)
-        )
+    if isinstance(data.get("cameras"), list):
+        mounts = _read_entries(path, data)
     else:
         mounts = _read_camchain(path, data)
     if mounts:
         _check_mounts(path, mounts)
     return mounts
+
+
+def _read_entries(path: str, data: Mapping[str, Any]) -> tuple[RigCamera, ...]:
+    """Return the cameras of our own format, which has no other entries than `cameras`.
+
+    Raises:
+        FileFormatError: it has others, or one of its cameras cannot be used.
+    """
+    if set(data) != {"cameras"}:
+        raise FileFormatError(
+            f"{path}: expected `cameras` alone, got {', '.join(map(str, data))[:80]}"
+        )
+    return tuple(
+        _read_entry(path, index, entry) for index, entry in enumerate(data["cameras"])
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -143,11 +143,8 @@ def _parse_thing(part: str) -> RequestedThing:
     options = _parse_options(part, words[2:])
     x = _parse_number(part, "x", words[0], -MAX_DISTANCE, MAX_DISTANCE)
     y = _parse_number(part, "y", words[1], -MAX_DISTANCE, MAX_DISTANCE)
-    heading = 0.0
-    if "heading" in options:
-        heading = _parse_number(
-            part, "heading", options["heading"], -MAX_HEADING, MAX_HEADING
-        )
+    heading_text = options.get("heading", "0.0")
+    heading = _parse_number(part, "heading", heading_text, -MAX_HEADING, MAX_HEADING)
     size = None
     if "size" in options:
         size = _parse_number(part, "size", options["size"], MIN_METRES, MAX_METRES)
@@ -246,11 +243,7 @@ def add_things(
     requested = parse_things(things_spec)
     if not requested:
         return scene
-    if scene.object.size_in_metres is None:
-        raise InputError(
-            f"things: their positions are in metres from {scene.object_name}, whose "
-            "size is not known; give its longest side in metres, such as `size=0.1`"
-        )
+    _check_object_size(scene)
     parts = list[ThingPart]()
     remarks = list[str]()
     for thing in requested:
@@ -262,6 +255,19 @@ def add_things(
     # Overlaps are found in the scene with the things.
     remarks += _list_overlap_remarks(scene)
     return replace(scene, remarks=(*scene.remarks, *remarks))
+
+
+def _check_object_size(scene: SceneData) -> None:
+    """Check that the size of the object is known, as positions are in metres from it.
+
+    Raises:
+        InputError: it is not known.
+    """
+    if scene.object.size_in_metres is None:
+        raise InputError(
+            f"things: their positions are in metres from {scene.object_name}, whose "
+            "size is not known; give its longest side in metres, such as `size=0.1`"
+        )
 
 
 def _make_thing(
@@ -279,8 +285,34 @@ def _make_thing(
     Raises:
         InputError: its size in metres is not known, or its name is taken.
     """
-    object_spec = thing.object_spec
+    asset, metres = _load_sized_asset(thing, load)
     name = thing.name
+    if name in {part.name for part in scene.parts}:
+        raise InputError(
+            f"things: something of the scene is called {name} already; add name=NAME "
+            "to it"
+        )
+    pose = _compute_pose(scene, asset, thing, metres)
+    part = make_mesh_part(name, asset, pose, asset.material)
+    # the fields of the mesh, with the label of the thing if it has one
+    fields = {**vars(part), "label": thing.label or asset.label}
+    thing_part = ThingPart(**fields, size_in_metres=metres, lamps=thing.lamps)
+    return thing_part, _list_thing_remarks(scene, thing, asset)
+
+
+def _load_sized_asset(
+    thing: RequestedThing, load: Callable[[str, str | None], ObjectAsset]
+) -> tuple[ObjectAsset, float]:
+    """Load the object of a thing, and return it with its longest side in metres.
+
+    Args:
+        thing: what the user has requested.
+        load: loads an object by its name or file, and the axis that is its front.
+
+    Raises:
+        InputError: its size in metres is not known.
+    """
+    object_spec = thing.object_spec
     asset = with_size(load(object_spec, thing.facing), thing.size, unit=None)
     if asset.size_in_metres is None:
         example = f"{object_spec}@{thing.x:g},{thing.y:g},size=METRES"
@@ -288,19 +320,7 @@ def _make_thing(
             f"things: the size of {object_spec} in metres is not known; say it: "
             f"{example}"
         )
-    if name in {part.name for part in scene.parts}:
-        raise InputError(
-            f"things: something of the scene is called {name} already; add name=NAME "
-            "to it"
-        )
-    pose = _compute_pose(scene, asset, thing, asset.size_in_metres)
-    part = make_mesh_part(name, asset, pose, asset.material)
-    # the fields of the mesh, with the label of the thing if it has one
-    fields = {**vars(part), "label": thing.label or asset.label}
-    thing_part = ThingPart(
-        **fields, size_in_metres=asset.size_in_metres, lamps=thing.lamps
-    )
-    return thing_part, _list_thing_remarks(scene, thing, asset)
+    return asset, asset.size_in_metres
 
 
 def _list_thing_remarks(

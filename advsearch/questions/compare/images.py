@@ -61,11 +61,7 @@ class PairImages:
         if _has_same_images(first, second):  # store each image once
             side_of_letter.pop("b")
         files = {
-            row: [
-                f"images/pair-{pair_number}-{row}-{letter}.jpg"
-                for letter in side_of_letter
-            ]
-            for row in rows
+            row: _name_files(pair_number, row, list(side_of_letter)) for row in rows
         }
         self._save_images(rows, list(side_of_letter.values()), files, run)
         for row in rows:
@@ -150,6 +146,11 @@ class PairImages:
             return
         self.context.run.write_file(image.file, scenes.render_thumbnail(image.number))
         self.n_rendered += 1
+
+
+def _name_files(pair_number: int, row: int, letters: Sequence[str]) -> list[str]:
+    """Return the files of the images of a pair, relative to the run, by side."""
+    return [f"images/pair-{pair_number}-{row}-{letter}.jpg" for letter in letters]
 
 
 def _has_same_images(first: Side, second: Side) -> bool:

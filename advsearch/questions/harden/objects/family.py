@@ -281,9 +281,23 @@ def join_patches(
     vertices = np.concatenate([patch.vertices for patch in patches])
     # the point below the center, at the lowest height, and the largest extent
     origin, extent = assets.find_footing(vertices)
-    vertices = (vertices - origin) / extent
-    # Some vertices at poles belong to no triangle. They are removed: the new index of a
-    # vertex is its position in the ascending array `used`.
+    return _make_compact_mesh((vertices - origin) / extent, faces, normals, uvs)
+
+
+def _make_compact_mesh(
+    vertices: Array, faces: assets.IntArray, normals: Array, uvs: Array
+) -> assets.Mesh:
+    """Return a mesh of rounded values without the vertices that no triangle has.
+
+    There are such vertices at poles.
+
+    Args:
+        vertices: positions (V, 3).
+        faces: vertex indices (F, 3).
+        normals: (V, 3).
+        uvs: texture coordinates (V, 2).
+    """
+    # The new index of a vertex is its position in the ascending array `used`.
     used = np.unique(faces)
     renumbered_faces = np.searchsorted(used, faces).astype(np.uint32)
     return assets.Mesh(
