@@ -359,22 +359,40 @@ class SweepRunner:
             return None
         self._tried_failures.add(index)  # counted in `pairs_sought`
 
-        wrong_value = failure[factor]
-        rows = self._find_pair_rows(frames, factor, wrong_value)
+        rows = self._find_pair_rows(frames, factor, failure[factor])
         if rows is None:
             return None
+        # images of the first of both renders
+        pictures = self._list_thumbnails(f"{run_name}-0", rows)
+        return self._make_nearest_right(frames[0], rows, failure, factor, pictures)
+
+    def _make_nearest_right(
+        self,
+        frame: pd.DataFrame,
+        rows: tuple[int, int],
+        failure: dict[str, float | str],
+        factor: str,
+        pictures: list[str],
+    ) -> NearestRight:
+        """Describe a failure and the nearest configuration that is predicted right.
+
+        Args:
+            frame: rows of configurations along the factor.
+            rows: indices of the failure and of the other configuration.
+            failure: values of the failure by parameter.
+            factor: the parameter that varies.
+            pictures: files of both images.
+        """
         failure_row, nearest_row = rows
-        first_frame = frames[0]
         return NearestRight(
             values=failure,
             parameter=factor,
             unit=self.factor_table.attrs["units"][factor],
-            wrong_at=wrong_value,
-            right_at=first_frame[factor].tolist()[nearest_row],
-            failure_label=first_frame["label"][failure_row],
-            right_label=first_frame["label"][nearest_row],
-            # images of the first of both renders
-            pictures=self._list_thumbnails(f"{run_name}-0", rows),
+            wrong_at=failure[factor],
+            right_at=frame[factor].tolist()[nearest_row],
+            failure_label=frame["label"][failure_row],
+            right_label=frame["label"][nearest_row],
+            pictures=pictures,
         )
 
     def _find_pair_rows(
