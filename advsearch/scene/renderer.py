@@ -1007,10 +1007,8 @@ class Renderer:
                 if not tensor.requires_grad:
                     continue
                 gradient = _differentiate_input_sum(tensor, u, generator)
-                if gradient is None:
-                    continue
                 for group in groups:
-                    if bool(gradient[group.coordinates].any()):
+                    if gradient is not None and gradient[group.coordinates].any():
                         routes[group.name].add(name)
         return {name: frozenset(reached) for name, reached in routes.items()}
 

@@ -510,9 +510,7 @@ class SkeletonRig:
             node = self.node_of_joint[joint]
             rotation = _compose_axis_rotations(joint, number_by_name, device)
             rotation = self._convert_to_parent(rotation, node)
-            matrix = local_matrices[node]
-            upper_rows = torch.cat([rotation @ matrix[:3, :3], matrix[:3, 3:]], dim=1)
-            turned_matrix = torch.cat([upper_rows, matrix[3:]])
+            turned_matrix = _rotate_linear_part(local_matrices[node], rotation)
             local_matrices = local_matrices.index_copy(
                 0, torch.tensor([node], device=device), turned_matrix[None]
             )
@@ -571,6 +569,17 @@ def _replace_animated(
     nodes = torch.tensor([track.node for track in tracks], device=seconds.device)
     values = torch.stack([sample_track(track, seconds) for track in tracks])
     return rest_values.index_copy(0, nodes, values)
+
+
+def _rotate_linear_part(matrix: Tensor, rotation: Tensor) -> Tensor:
+    """Return a matrix (4, 4) whose linear part is rotated, and whose shift is the same.
+
+    Args:
+        matrix: (4, 4) from a node to its parent.
+        rotation: (3, 3).
+    """
+    upper_rows = torch.cat([rotation @ matrix[:3, :3], matrix[:3, 3:]], dim=1)
+    return torch.cat([upper_rows, matrix[3:]])
 
 
 def _compose_axis_rotations(
