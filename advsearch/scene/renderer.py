@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
@@ -105,6 +105,18 @@ class Crop(NamedTuple):
     window: Window  # window of the pixels that are rendered
     # radiance (H, W, 3) of the full image; with a backdrop (H, W, 4), with coverage
     surrounding_image: Tensor
+
+
+class _MomentRender(NamedTuple):
+    """What is rendered of one moment of an exposure."""
+
+    inputs: dict[str, Tensor]  # inputs of Mitsuba's scene
+    seed: int  # of the noise
+    spp: int  # samples per pixel
+    # (H, 1, 1) the moment's fraction of the exposure of each row. Rows of a sensor may
+    # be read one after the other: then each is exposed during some moments only. Over
+    # all moments the fractions of a row add up to 1.
+    row_weights: Tensor
 
 
 # Largest size of a group whose motion of outlines is measured.
@@ -333,14 +345,13 @@ class Renderer:
             # Autograd does not differentiate all coordinates through `autograd_u` if
             # that is another tensor than u. The others are differentiated by
             # differences.
-            needs_differences = (
-                autograd_u is not u
-                and torch.is_grad_enabled()
-                and len(self._select_difference_groups()) > 0
-            )
-            if needs_differences:
+            if autograd_u is not u and self._needs_differences():
                 image = _Differences.apply(self, seed, spp, u, image)  # type: ignore[no-untyped-call]
             return image
+
+    def _needs_differences(self) -> bool:
+        """Return whether a derivative is wanted that takes differences."""
+        return torch.is_grad_enabled() and len(self._select_difference_groups()) > 0
 
     def radiance(self, u: Configuration, seed: int = 0, spp: int = 16) -> Tensor:
         """Render linear radiance (H, W, 3) float32; arguments as for a call.
@@ -432,18 +443,46 @@ class Renderer:
         ]
         mean = (halves[0] + halves[1]) / 2.0
         # One render of the guides serves both halves; its seed follows from the first.
-        guide_seed = seeds.derive_seed(self.root_seed, "guides", noise_seeds[0])
+        denoise = self._make_denoiser(
+            scene_inputs, noise_seeds[0], spp, hides_environment
+        )
+        return halves, self._denoise_in_window(mean, denoise)
+
+    def _make_denoiser(
+        self,
+        scene_inputs: Mapping[str, Tensor],
+        noise_seed: int,
+        spp: int,
+        hides_environment: bool,
+    ) -> Callable[[Tensor], Tensor]:
+        """Render a denoiser's guides, and return the function that denoises with them.
+
+        Args:
+            scene_inputs: inputs of Mitsuba's scene.
+            noise_seed: seed of the images to be denoised, from which that of the guides
+                is derived.
+            spp: samples per pixel of the guides.
+            hides_environment: whether the environment is hidden behind a backdrop.
+        """
+        guide_seed = seeds.derive_seed(self.root_seed, "guides", noise_seed)
         with self.scene.limit_window(self.window):
             albedo, normal = self.scene.render_guides(scene_inputs, guide_seed, spp)
         plane_radiance = self.scene.plane_radiance if hides_environment else None
-        denoise = partial(
+        return partial(
             denoise_image, albedo=albedo, normal=normal, plane_radiance=plane_radiance
         )
+
+    def _denoise_in_window(
+        self, image: Tensor, denoise: Callable[[Tensor], Tensor]
+    ) -> Tensor:
+        """Denoise an image (H, W, C); with a crop only its window, which alone is noisy.
+
+        The surroundings of the window were denoised when they were rendered.
+        """
         if self.crop is None:
-            return halves, denoise(mean)
-        # Only the window is noisy: the surroundings were denoised when they were made.
-        clean = denoise(self.crop.window.crop_image(mean))
-        return halves, self.crop.window.paste(clean, self.crop.surrounding_image)
+            return denoise(image)
+        clean = denoise(self.crop.window.crop_image(image))
+        return self.crop.window.paste(clean, self.crop.surrounding_image)
 
     def compute_scene_inputs(self, u: Tensor) -> dict[str, Tensor]:
         """Return the inputs of Mitsuba's scene at a configuration, without a graph."""
@@ -483,7 +522,10 @@ class Renderer:
             )
             if "backdrop.front" in inputs:
                 _remove_hidden_surfaces(surfaces, inputs["backdrop.front"], subdivision)
-        # The scene is in object sizes.
+        return self._convert_depths_to_metres(surfaces)
+
+    def _convert_depths_to_metres(self, surfaces: Surfaces) -> Surfaces:
+        """Return surfaces with depths in metres; those of the scene are in object sizes."""
         object_size = self.scene.description_and_filter[0].size_in_metres
         return replace(
             surfaces,
@@ -596,23 +638,26 @@ class Renderer:
             needs no derivatives, both are the same object.
         """
         u = _to_tensor(u)
+        self._check_shape(u)
+        if not 1 <= spp <= MAX_SPP:
+            raise InputError(f"spp: expected 1 to {MAX_SPP} samples a pixel, got {spp}")
+        _check_in_unit_box(u)
+        _check_can_have_gradient(u)
+        with _leave_inference_mode():
+            u = u.clone() if u.is_inference() else u
+            return u, self._limit_autograd(u)
+
+    def _check_shape(self, u: Tensor) -> None:
+        """Check that a configuration has the shape (d,) of the start.
+
+        Raises:
+            InputError: it has another one.
+        """
         if u.shape != self._shape:
             raise InputError(
                 f"render: expected u of shape {tuple(self._shape)}, got "
                 f"{tuple(u.shape)}"
             )
-        if not 1 <= spp <= MAX_SPP:
-            raise InputError(f"spp: expected 1 to {MAX_SPP} samples a pixel, got {spp}")
-        _check_in_unit_box(u)
-        if u.is_inference() and u.requires_grad:
-            raise InputError(
-                "render: u was made in `torch.inference_mode()`, so that nothing can "
-                "be differentiated with respect to "
-                "it; make it outside, or pass `u.detach()` for the picture alone"
-            )
-        with _leave_inference_mode():
-            u = u.clone() if u.is_inference() else u
-            return u, self._limit_autograd(u)
 
     def _limit_autograd(self, u: Tensor) -> Tensor:
         """Return a configuration that autograd differentiates only as the plan states.
@@ -643,15 +688,11 @@ class Renderer:
             (H, W, 3); for a rig of K cameras their images side by side, (H, K W, 3).
         """
         renders_before = self.n_renders
-        images = list[Tensor]()
         # without a rig there is one camera, with no mount
-        for index, mount in enumerate(
-            self.scene.description_and_filter[0].rig or (None,)
-        ):
-            # the first camera has the noise of a scene without a rig
-            camera_seed = seed
-            if index > 0:
-                camera_seed = seeds.derive_seed(seed, "camera", index)
+        mounts = self.scene.description_and_filter[0].rig or (None,)
+        images = list[Tensor]()
+        for index, mount in enumerate(mounts):
+            camera_seed = _derive_camera_seed(seed, index)
             images.append(self._render_camera(mount, u, camera_seed, spp, display))
         if len(images) == 1:
             return images[0]
@@ -726,7 +767,8 @@ class Renderer:
             hide_environment: hide the environment behind a backdrop.
         """
         renders_before = self.n_renders
-        exposed, guides = self._sum_moments(mount, u, seed, spp, hide_environment)
+        renders = self._make_moment_renders(mount, u, seed, spp)
+        exposed, guides = self._sum_moments(renders, hide_environment)
         # `render_radiance` has counted each moment.
         self.n_renders = renders_before + 1
         if self.formation.denoiser != "oidn":
@@ -735,47 +777,52 @@ class Renderer:
         # the image before denoising.
         return exposed + self._compute_denoising_change(exposed, guides)
 
-    def _sum_moments(
-        self,
-        mount: RigCamera | None,
-        u: Tensor,
-        seed: int,
-        spp: int,
-        hide_environment: bool,
-    ) -> tuple[Tensor, Tensor]:
-        """Return the weighted sums over moments of radiance, and of the denoiser's guides.
+    def _make_moment_renders(
+        self, mount: RigCamera | None, u: Tensor, seed: int, spp: int
+    ) -> Iterator[_MomentRender]:
+        """Yield what is to be rendered of each moment of an exposure.
 
-        Rows of a sensor may be read one after the other, so that each row is exposed
-        during some of the moments only. `row_fractions` (H,) of a moment are its
-        fractions of the exposure of each row, which add up to 1 over the moments. The
-        guides of the denoiser are averaged in the same manner; they are 0 without a
-        denoiser. The arguments are those of `_render_exposure`.
+        The arguments are those of `_render_exposure`.
+        """
+        for index, moment in enumerate(self.moments):
+            inputs = self._make_camera_inputs(mount, u, moment.input_mapping)
+            yield _MomentRender(
+                inputs=_select_scene_inputs(inputs),
+                seed=seeds.derive_seed(seed, "moment", index),
+                spp=max(1, math.ceil(spp * moment.sample_fraction)),
+                row_weights=moment.row_fractions[:, None, None],
+            )
+
+    def _sum_moments(
+        self, renders: Iterable[_MomentRender], hide_environment: bool
+    ) -> tuple[Tensor, Tensor]:
+        """Render the moments of an exposure, and sum their images by the rows' weights.
+
+        Args:
+            renders: what is rendered of each moment.
+            hide_environment: hide the environment behind a backdrop.
+
+        Returns:
+            Radiance (H, W, C), which is not denoised, and the denoiser's guides (H, W,
+            6); the guides are 0 without a denoiser.
         """
         # sums over moments, which the first addition makes images
         exposed = torch.zeros(())
         guides = torch.zeros(())
-        for index, moment in enumerate(self.moments):
-            inputs = _select_scene_inputs(
-                self._make_camera_inputs(mount, u, moment.input_mapping)
+        for render in renders:
+            radiance = self.render_radiance(
+                render.inputs, render.seed, render.spp, hide_environment, denoised=False
             )
-            moment_seed = seeds.derive_seed(seed, "moment", index)
-            row_weights = moment.row_fractions[:, None, None]
-            samples = max(1, math.ceil(spp * moment.sample_fraction))
-            exposed = exposed + row_weights * self.render_radiance(
-                inputs, moment_seed, samples, hide_environment, denoised=False
-            )
+            exposed = exposed + render.row_weights * radiance
             if self.formation.denoiser == "oidn":
-                with torch.no_grad():
-                    moment_guides = self._render_guides(inputs, moment_seed, samples)
-                    guides = guides + row_weights * moment_guides
+                guides = guides + render.row_weights * self._render_guides(render)
         return exposed, guides
 
-    def _render_guides(
-        self, inputs: Mapping[str, Tensor], moment_seed: int, spp: int
-    ) -> Tensor:
+    @torch.no_grad()
+    def _render_guides(self, render: _MomentRender) -> Tensor:
         """Render the guides of the denoiser (H, W, 6), albedo and normals, of a moment."""
-        guide_seed = seeds.derive_seed(self.root_seed, "guides", moment_seed)
-        albedo, normal = self.scene.render_guides(inputs, guide_seed, spp)
+        guide_seed = seeds.derive_seed(self.root_seed, "guides", render.seed)
+        albedo, normal = self.scene.render_guides(render.inputs, guide_seed, render.spp)
         return torch.cat([albedo, normal], dim=-1)
 
     @torch.no_grad()
@@ -864,17 +911,25 @@ class Renderer:
             return inputs
         front_inputs = dict(inputs)
         depth = front_inputs.pop("backdrop.depth")
-        # The depth has n x n points in each pixel of the image.
+        front_inputs["backdrop.front"] = self._find_hidden_fractions(inputs, depth)
+        return front_inputs
+
+    def _find_hidden_fractions(
+        self, inputs: Mapping[str, Tensor], depth: Tensor
+    ) -> Tensor:
+        """Return the fractions (H, W, 2) of object and ground that a photograph hides.
+
+        Args:
+            inputs: inputs of the scene, and the blur of the backdrop if it has one.
+            depth: (n H, n W) depth of the photograph, at n x n points in each pixel.
+        """
         image_height, _image_width = self.formation.resolution
         n_points = depth.shape[0] // image_height
         surfaces = self.scene.find_surfaces(_select_scene_inputs(inputs), n_points)
         blur = float(inputs["backdrop.blur"]) if "backdrop.blur" in inputs else 0.0
         # A blur reaches about three standard deviations; 1 is for the pixel itself.
         radius = 1 + math.ceil(3.0 * blur)
-        front_inputs["backdrop.front"] = compute_front(
-            surfaces, depth, n_points, radius
-        )
-        return front_inputs
+        return compute_front(surfaces, depth, n_points, radius)
 
     def render_radiance(
         self,
@@ -967,19 +1022,28 @@ class Renderer:
         it has a default step: `TURN_STEP` if it is periodic, as an angle over a full
         turn, and else `DEFAULT_STEP`, which `compute_steps` uses for a speed of 0.
         """
-        speeds = torch.zeros(len(self.start))  # pixels per unit of each coordinate
-        coordinates = _list_measured_coordinates(groups)
-        if motion is not None and coordinates:
-            speeds = motion.measure_speeds(
-                lambda u: self.scene.input_assembler(self.space.inputs(u)),
-                self.start,
-                coordinates,
-            )
+        speeds = self._measure_outline_speeds(groups, motion)
         steps = compute_steps(speeds)
         for group in groups:
             if group.periodic and not bool(speeds[group.coordinates].any()):
                 steps[group.coordinates] = TURN_STEP
         return steps
+
+    def _measure_outline_speeds(
+        self, groups: tuple[Group, ...], motion: Motion | None
+    ) -> Tensor:
+        """Return the speeds (d,) of outlines in pixels per unit of each coordinate.
+
+        They are 0 where they are not measured, see `_list_measured_coordinates`.
+        """
+        coordinates = _list_measured_coordinates(groups)
+        if motion is None or not coordinates:
+            return torch.zeros(len(self.start))
+        return motion.measure_speeds(
+            lambda u: self.scene.input_assembler(self.space.inputs(u)),
+            self.start,
+            coordinates,
+        )
 
     def _find_reached_inputs(
         self, groups: tuple[Group, ...]
@@ -995,22 +1059,48 @@ class Renderer:
         """
         if not any(set(group.valid) & ADJOINT_ESTIMATORS for group in groups):
             return {}
-        routes: dict[str, set[str]] = {group.name: set() for group in groups}
         generator = torch.Generator().manual_seed(0)
-        noise = torch.rand(self.start.shape, generator=generator)
-        # The point is half way from the start to the center, with some noise: at
-        # borders and special values a derivative may be zero by chance.
-        u = (0.5 * self.start + 0.25 + 0.1 * (noise - 0.5)).requires_grad_()
+        u = self._sample_generic_configuration(generator).requires_grad_()
+        gradients = dict[str, Tensor]()  # by the name of the scene input
         with torch.enable_grad():
             inputs = self.scene.input_assembler(self.space.inputs(u))
             for name, tensor in inputs.items():
-                if not tensor.requires_grad:
-                    continue
-                gradient = _differentiate_input_sum(tensor, u, generator)
-                for group in groups:
-                    if gradient is not None and gradient[group.coordinates].any():
-                        routes[group.name].add(name)
-        return {name: frozenset(reached) for name, reached in routes.items()}
+                if tensor.requires_grad:
+                    gradient = _differentiate_input_sum(tensor, u, generator)
+                    if gradient is not None:
+                        gradients[name] = gradient
+        return {group.name: _find_inputs_of(group, gradients) for group in groups}
+
+    def _sample_generic_configuration(self, generator: torch.Generator) -> Tensor:
+        """Sample a configuration (d,) half way from the start to the center of the box.
+
+        It has some noise, since at borders and special values a derivative may be zero
+        by chance.
+        """
+        noise = torch.rand(self.start.shape, generator=generator)
+        return 0.5 * self.start + 0.25 + 0.1 * (noise - 0.5)
+
+
+def _find_inputs_of(group: Group, gradients: Mapping[str, Tensor]) -> frozenset[str]:
+    """Return the scene inputs that a group of coordinates reaches.
+
+    Args:
+        group: the group.
+        gradients: derivatives (d,) by all coordinates, by the name of the input.
+    """
+    return frozenset(
+        name
+        for name, gradient in gradients.items()
+        if gradient[group.coordinates].any()
+    )
+
+
+def _derive_camera_seed(seed: int, index: int) -> int:
+    """Return the seed of the noise of one camera of a rig.
+
+    The first camera has the noise of a scene without a rig.
+    """
+    return seed if index == 0 else seeds.derive_seed(seed, "camera", index)
 
 
 @cache_per_scene
@@ -1040,6 +1130,20 @@ def _check_in_unit_box(u: Tensor) -> None:
         raise InputError(
             "render: expected every entry of u in [0, 1]; project u "
             "before you render it"
+        )
+
+
+def _check_can_have_gradient(u: Tensor) -> None:
+    """Check that a configuration that requires a gradient can have one.
+
+    Raises:
+        InputError: it was made in torch's inference mode.
+    """
+    if u.is_inference() and u.requires_grad:
+        raise InputError(
+            "render: u was made in `torch.inference_mode()`, so that nothing can "
+            "be differentiated with respect to "
+            "it; make it outside, or pass `u.detach()` for the picture alone"
         )
 
 
@@ -1177,11 +1281,8 @@ class _Radiance(torch.autograd.Function):
         ctx.window = renderer.window
         ctx.save_for_backward(*tensors)
         inputs = dict(zip(names, tensors, strict=True))
-        noise_seed = seeds.derive_seed(renderer.root_seed, "primal", seed)
-        image_seeds = {"hidden" if hide else "path": noise_seed}
-        if denoised and renderer.formation.denoiser == "oidn":
-            guide_seed = seeds.derive_seed(renderer.root_seed, "guides", seed)
-            image_seeds["guides"] = guide_seed
+        needs_guides = denoised and renderer.formation.denoiser == "oidn"
+        image_seeds = _derive_image_seeds(renderer.root_seed, seed, hide, needs_guides)
         # in the order of `image_seeds`
         images = _render_seeded_images(renderer, inputs, image_seeds, spp)
         rendered = renderer.replace_non_finite(images[0])
@@ -1202,27 +1303,31 @@ class _Radiance(torch.autograd.Function):
         inputs = dict(zip(ctx.names, ctx.saved_tensors, strict=True))
         noise_seed = seeds.derive_seed(renderer.root_seed, "gradient", ctx.seed)
         cotangent = renderer.replace_non_finite(cotangent)
-        gradient_of_input = dict[str, Tensor]()
-        # The material form is right for more inputs. So it differentiates those that
-        # are reached by groups of both estimators.
-        by_material = _select_reached_inputs(renderer, "material")
-        by_interior = _select_reached_inputs(renderer, "adjoint") - by_material
-        material_names = [name for name in inputs if name in by_material]
-        interior_names = [name for name in inputs if name in by_interior]
-        if material_names:
-            gradient_of_input |= _render_material_gradients(
-                ctx, inputs, cotangent, noise_seed, material_names
-            )
-        if interior_names:
-            gradient_of_input |= _render_interior_gradients(
-                ctx, inputs, cotangent, noise_seed, interior_names
-            )
+        gradient_of_input = _render_input_gradients(ctx, inputs, cotangent, noise_seed)
         for name, gradient in gradient_of_input.items():
             gradient_of_input[name] = renderer.replace_non_finite(gradient)
         # The six arguments of `forward` between `ctx` and the tensors have no
         # gradients.
         no_gradients = (None,) * 6
         return (*no_gradients, *map(gradient_of_input.get, ctx.names))
+
+
+def _derive_image_seeds(
+    root_seed: int, seed: int, hide: bool, needs_guides: bool
+) -> dict[str, int]:
+    """Return the seeds of the images that a render takes, by kind; radiance first.
+
+    Args:
+        root_seed: the renderer's seed.
+        seed: seed of the noise of this render.
+        hide: hide the environment behind a backdrop.
+        needs_guides: render the denoiser's guides, too.
+    """
+    noise_seed = seeds.derive_seed(root_seed, "primal", seed)
+    image_seeds = {"hidden" if hide else "path": noise_seed}
+    if needs_guides:
+        image_seeds["guides"] = seeds.derive_seed(root_seed, "guides", seed)
+    return image_seeds
 
 
 def _render_seeded_images(
@@ -1271,6 +1376,32 @@ def _denoise_with_guides(
         plane_radiance=renderer.scene.plane_radiance if hide else None,
         quick=renderer.formation.quick,
     )
+
+
+def _render_input_gradients(
+    ctx: Any, inputs: dict[str, Tensor], cotangent: Tensor, noise_seed: int
+) -> dict[str, Tensor]:
+    """Return the gradients of the inputs that coordinates with an adjoint reach.
+
+    Each of the two adjoints is rendered only if an input needs it. The arguments are
+    those of `_render_material_gradients`.
+    """
+    # The material form is right for more inputs. So it differentiates those that are
+    # reached by groups of both estimators.
+    by_material = _select_reached_inputs(ctx.renderer, "material")
+    by_interior = _select_reached_inputs(ctx.renderer, "adjoint") - by_material
+    material_names = [name for name in inputs if name in by_material]
+    interior_names = [name for name in inputs if name in by_interior]
+    gradient_of_input = dict[str, Tensor]()
+    if material_names:
+        gradient_of_input |= _render_material_gradients(
+            ctx, inputs, cotangent, noise_seed, material_names
+        )
+    if interior_names:
+        gradient_of_input |= _render_interior_gradients(
+            ctx, inputs, cotangent, noise_seed, interior_names
+        )
+    return gradient_of_input
 
 
 def _render_material_gradients(

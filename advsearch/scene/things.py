@@ -11,7 +11,7 @@ object.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -101,18 +101,28 @@ def parse_things(things_spec: str | None) -> tuple[RequestedThing, ...]:
     """
     things: list[RequestedThing] = []
     for part in filter(None, map(str.strip, (things_spec or "").split(";"))):
-        thing = _parse_thing(part)
         used_names = [*RESERVED_NAMES, *(other.name for other in things)]
-        has_chosen_name = "name=" in part
-        if thing.name in used_names and has_chosen_name:
-            raise InputError(
-                f"things: {part}: another thing of the scene is called "
-                f"{thing.name}; choose another name"
-            )
-        things.append(replace(thing, name=_find_unused_name(thing.name, used_names)))
+        things.append(_parse_unique_thing(part, used_names))
     if len(things) > MAX_THINGS:
         raise InputError(f"things: expected at most {MAX_THINGS}, got {len(things)}")
     return tuple(things)
+
+
+def _parse_unique_thing(part: str, used_names: Sequence[str]) -> RequestedThing:
+    """Parse one thing, with a number added to its name if that is used.
+
+    Raises:
+        InputError: the thing is not written as `_parse_thing` expects, or the user has
+            chosen a name that is used.
+    """
+    thing = _parse_thing(part)
+    has_chosen_name = "name=" in part
+    if thing.name in used_names and has_chosen_name:
+        raise InputError(
+            f"things: {part}: another thing of the scene is called "
+            f"{thing.name}; choose another name"
+        )
+    return replace(thing, name=_find_unused_name(thing.name, used_names))
 
 
 def _find_unused_name(name: str, used_names: Sequence[str]) -> str:
@@ -145,9 +155,6 @@ def _parse_thing(part: str) -> RequestedThing:
     y = _parse_number(part, "y", words[1], -MAX_DISTANCE, MAX_DISTANCE)
     heading_text = options.get("heading", "0.0")
     heading = _parse_number(part, "heading", heading_text, -MAX_HEADING, MAX_HEADING)
-    size = None
-    if "size" in options:
-        size = _parse_number(part, "size", options["size"], MIN_METRES, MAX_METRES)
     # Without `name=` the file's name counts, without what is behind a #, which names a
     # part of the file, as in scene.glb#chair.
     name = make_safe_name(Path(options.get("name") or object_spec.partition("#")[0]))
@@ -156,12 +163,19 @@ def _parse_thing(part: str) -> RequestedThing:
         x=x,
         y=y,
         heading=heading,
-        size=size,
+        size=_parse_size(part, options),
         name=name,
         label=options.get("label"),
         lamps=options.get("lamps", LAMPS_OFF),
         facing=options.get("facing"),
     )
+
+
+def _parse_size(part: str, options: Mapping[str, str]) -> float | None:
+    """Return the size of a thing in metres; None if its options have none."""
+    if "size" not in options:
+        return None
+    return _parse_number(part, "size", options["size"], MIN_METRES, MAX_METRES)
 
 
 def _split_thing(part: str) -> tuple[str, list[str]]:
@@ -244,12 +258,9 @@ def add_things(
     if not requested:
         return scene
     _check_object_size(scene)
-    parts = list[ThingPart]()
-    remarks = list[str]()
-    for thing in requested:
-        part, thing_remarks = _make_thing(scene, thing, load)
-        parts.append(part)
-        remarks += thing_remarks
+    things = [_make_thing(scene, thing, load) for thing in requested]
+    parts = [part for part, _ in things]
+    remarks = [remark for _, thing_remarks in things for remark in thing_remarks]
     # `things_spec` is a string here: None has no requested things.
     scene = replace(scene, parts=(*scene.parts, *parts), things_spec=things_spec or "")
     # Overlaps are found in the scene with the things.
@@ -463,6 +474,14 @@ def add_solid_remarks(scene: AnyScene) -> AnyScene:
         for part in scene.parts
         if isinstance(part, ThingPart)
     }
+    remarks = _list_solid_remarks(scene, footprints)
+    return replace(scene, remarks=(*scene.remarks, *remarks))
+
+
+def _list_solid_remarks(
+    scene: SceneData, footprints: Mapping[str, Footprint]
+) -> list[str]:
+    """Return a remark on each footprint that overlaps a solid of the place, by name."""
     remarks = list[str]()
     for name, outline in footprints.items():
         solid = find_overlapping_solid(scene, outline)
@@ -471,7 +490,7 @@ def add_solid_remarks(scene: AnyScene) -> AnyScene:
                 f"{name[0].upper()}{name[1:]} stands in {solid} of the "
                 "place around it: put it elsewhere."
             )
-    return replace(scene, remarks=(*scene.remarks, *remarks))
+    return remarks
 
 
 def list_camera_remarks(
