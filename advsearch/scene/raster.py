@@ -389,11 +389,7 @@ def rasterize_charts(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
     shape = (resolution, resolution) if isinstance(resolution, int) else resolution
     corners = _to_texel_coordinates(mesh, shape)
     face, row, column = find_candidate_pixels(corners, shape)
-    if len(face) == 0:
-        raise InputError(
-            f"mesh texture coordinates: none of the {shape[0]} x {shape[1]} texels "
-            "lies in a triangle; unwrap the mesh again"
-        )
+    _check_any_texel_covered(face, shape)
     points = np.stack([column, row], axis=1)
     weights = _compute_clipped_weights(corners[face], points)
     face_map = np.zeros(shape, np.int64)
@@ -403,6 +399,23 @@ def rasterize_charts(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
     weight_map[row, column] = weights
     is_covered[row, column] = True
     return _fill_charts(mesh, face_map, weight_map, is_covered)
+
+
+def _check_any_texel_covered(face: IntArray, shape: tuple[int, int]) -> None:
+    """Check that the triangles of a texture of some shape cover a texel.
+
+    Args:
+        face: (N,) the triangle of each texel that is covered.
+        shape: height and width of the texture.
+
+    Raises:
+        InputError: no texel is covered.
+    """
+    if len(face) == 0:
+        raise InputError(
+            f"mesh texture coordinates: none of the {shape[0]} x {shape[1]} texels "
+            "lies in a triangle; unwrap the mesh again"
+        )
 
 
 def _fill_charts(
@@ -473,17 +486,43 @@ def look_up_texture(
     top = np.floor(y)
     column_fraction = (x - left).astype(np.float32)[..., None]
     row_fraction = (y - top).astype(np.float32)[..., None]
-    # beyond an edge the texture begins again
-    column0 = (left % width).astype(np.int64)
-    column1 = ((left + 1) % width).astype(np.int64)
-    row0 = (top % height).astype(np.int64)
-    row1 = ((top + 1) % height).astype(np.int64)
-    upper_left = texels[row0, column0] * (1 - column_fraction)
-    upper = upper_left + texels[row0, column1] * column_fraction
-    lower_left = texels[row1, column0] * (1 - column_fraction)
-    lower = lower_left + texels[row1, column1] * column_fraction
+    columns = _wrap_neighbors(left, width)
+    upper_row, lower_row = _wrap_neighbors(top, height)
+    upper = _interpolate_columns(texels, upper_row, columns, column_fraction)
+    lower = _interpolate_columns(texels, lower_row, columns, column_fraction)
     mean = upper * (1 - row_fraction) + lower * row_fraction
     return np.asarray(mean, dtype=np.float32)
+
+
+def _wrap_neighbors(
+    first: npt.NDArray[np.floating], size: int
+) -> tuple[IntArray, IntArray]:
+    """Return rows or columns (...) and the next ones, wrapped at a texture's border.
+
+    Args:
+        first: (...) whole numbers, which may be outside of the texture.
+        size: number of rows or columns of the texture.
+    """
+    return (first % size).astype(np.int64), ((first + 1) % size).astype(np.int64)
+
+
+def _interpolate_columns(
+    texels: Float32Array,
+    row: IntArray,
+    columns: tuple[IntArray, IntArray],
+    fraction: Float32Array,
+) -> npt.NDArray[np.floating]:
+    """Interpolate linearly between two texels of a row, (..., C).
+
+    Args:
+        texels: (H, W, C) the texture.
+        row: (...) row of both texels.
+        columns: (...) column of the left texel, and (...) of the right one.
+        fraction: (..., 1) 0 at the left texel and 1 at the right one.
+    """
+    left_column, right_column = columns
+    left_part = texels[row, left_column] * (1 - fraction)
+    return np.asarray(left_part + texels[row, right_column] * fraction)
 
 
 class MeshSurface:
@@ -543,11 +582,7 @@ class MeshSurface:
         p = np.cross(direction, c - a)
         determinant = ((b - a) * p).sum(axis=1)
         # 0 means that the ray is in the plane of the face
-        inverse = np.where(
-            np.abs(determinant) > 1e-15,
-            1.0 / np.where(determinant == 0.0, 1.0, determinant),
-            0.0,
-        )
+        inverse = _invert_unless_tiny(determinant)
         t = origin - a
         u = (t * p).sum(axis=1) * inverse
         q = np.cross(t, b - a)
@@ -589,6 +624,12 @@ class MeshSurface:
         left_face, right_face = self._neighbours[is_pair_inside].T
         component = find_components(len(is_inside), left_face, right_face)
         return np.asarray(is_inside & (component == component[face]))
+
+
+def _invert_unless_tiny(values: Float64Array) -> Float64Array:
+    """Return 1 / value for each value (N,), and 0 for values that are about 0."""
+    divisor = np.where(values == 0.0, 1.0, values)
+    return np.where(np.abs(values) > 1e-15, 1.0 / divisor, 0.0)
 
 
 def _find_neighboring_faces(mesh: Mesh) -> IntArray:

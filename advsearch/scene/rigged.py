@@ -160,27 +160,15 @@ class _JointArrays(NamedTuple):
     def join(cls, parts: Sequence[Movable], vertices: IntArray) -> _JointArrays:
         """Concatenate the arrays of all parts, and select rows for the mesh.
 
-        A joint of a part is an index into the part's list of nodes. The lists of all
-        parts are concatenated, and a joint becomes an index into the result.
-
         Args:
             parts: parts of the file.
             vertices: (V,) for each vertex of the mesh its index in the concatenated
                 vertices of all parts.
         """
-        max_joints = max(part.joints.shape[1] for part in parts)
         points = np.concatenate([part.vertices for part in parts])
-        # index in `nodes` of the first node of each part
-        node_counts = [len(part.joint_nodes) for part in parts]
-        node_starts = np.cumsum(node_counts) - node_counts
-        joints = np.concatenate(
-            [
-                _pad_columns(part.joints + start, max_joints)
-                for part, start in zip(parts, node_starts, strict=True)
-            ]
-        )
+        joints = _concatenate_joints(parts)
         weights = np.concatenate(
-            [_pad_columns(part.weights, max_joints) for part in parts]
+            [_pad_columns(part.weights, joints.shape[1]) for part in parts]
         )
         nodes = np.concatenate([part.joint_nodes for part in parts])
         inverse_binds = np.concatenate([part.inverse_binds for part in parts])
@@ -191,6 +179,24 @@ class _JointArrays(NamedTuple):
             nodes=torch.from_numpy(nodes),
             inverse_binds=torch.from_numpy(inverse_binds),
         )
+
+
+def _concatenate_joints(parts: Sequence[Movable]) -> IntArray:
+    """Return the joints (vertices, n) of all parts, as indices of their joined nodes.
+
+    A joint of a part is an index into the part's list of nodes. The lists of all parts
+    are concatenated. n is the largest number of joints that a vertex has.
+    """
+    max_joints = max(part.joints.shape[1] for part in parts)
+    # index of the first node of each part among those of all parts
+    node_counts = [len(part.joint_nodes) for part in parts]
+    node_starts = np.cumsum(node_counts) - node_counts
+    return np.concatenate(
+        [
+            _pad_columns(part.joints + start, max_joints)
+            for part, start in zip(parts, node_starts, strict=True)
+        ]
+    )
 
 
 def _pad_columns(values: np.ndarray, count: int) -> np.ndarray:
@@ -375,17 +381,25 @@ class SkeletonRig:
                 playing_clip, seconds.to(device)
             )
         local_matrices = self._turn_joints(local_matrices, number_by_name)
-        # (joints, 3, 4) from the rest pose to the scene, without the last row, which is
-        # 0 0 0 1
-        joint_matrices = (
-            self._compute_world(local_matrices)[self._nodes.to(device)]
-            @ self._inverse_binds.to(device)
-        )[:, :3]
+        joint_matrices = self._compute_joint_matrices(local_matrices)
         points = self._compute_morphed_vertices(number_by_name, clip_weights, device)
         matrices = self._blend_joint_matrices(joint_matrices)
         return (
             torch.einsum("vij,vj->vi", matrices[:, :, :3], points) + matrices[:, :, 3]
         )
+
+    def _compute_joint_matrices(self, local_matrices: Tensor) -> Tensor:
+        """Return the matrices (joints, 3, 4) from the rest pose to the scene.
+
+        They are without the last row, which is 0 0 0 1.
+
+        Args:
+            local_matrices: (N, 4, 4) from each node to its parent.
+        """
+        device = local_matrices.device
+        world = self._compute_world(local_matrices)
+        world_of_joint = world[self._nodes.to(device)]
+        return (world_of_joint @ self._inverse_binds.to(device))[:, :3]
 
     def _blend_joint_matrices(self, joint_matrices: Tensor) -> Tensor:
         """Return the weighted mean (V, 3, 4) of the matrices of each vertex's joints.
@@ -653,11 +667,16 @@ def sample_track(track: Track, seconds: Tensor) -> Tensor:
     if track.interpolation == "CUBICSPLINE":
         spline = _interpolate_spline(keys[start_key], keys[end_key], fraction, span)
         return spline / spline.norm().clamp_min(1e-12) if is_rotation else spline
-    start_value = keys[start_key, value_index]
-    end_value = keys[end_key, value_index]
-    if is_rotation:
-        return slerp(start_value, end_value, fraction)
-    return start_value + fraction * (end_value - start_value)
+    # slerp interpolates on the sphere, lerp along a line
+    interpolate = slerp if is_rotation else lerp
+    return interpolate(
+        keys[start_key, value_index], keys[end_key, value_index], fraction
+    )
+
+
+def lerp(start: Tensor, end: Tensor, fraction: Tensor) -> Tensor:
+    """Interpolate linearly between two values (W,); the fraction () is 0 at the start."""
+    return start + fraction * (end - start)
 
 
 def _interpolate_spline(

@@ -138,19 +138,27 @@ def _generate_atlas(soup: TriangleSoup, groups: Sequence[IntArray]) -> xatlas.At
         groups: for each group the indices of its faces.
     """
     for resolution in (ATLAS_SIZE, 0):  # 0: one atlas, however large
-        atlas = xatlas.Atlas()
-        for group in groups:
-            used, corners = np.unique(soup.faces[group], return_inverse=True)
-            atlas.add_mesh(
-                (soup.points[used] * _XATLAS_SCALE).astype(np.float32),
-                corners.reshape(-1, 3).astype(np.uint32),
-            )
         options = xatlas.PackOptions()
         options.resolution = resolution
         options.padding = ATLAS_PADDING
+        atlas = _make_unpacked_atlas(soup, groups)
         atlas.generate(xatlas.ChartOptions(), options)
         if atlas.atlas_count == 1:
             break
+    return atlas
+
+
+def _make_unpacked_atlas(
+    soup: TriangleSoup, groups: Sequence[IntArray]
+) -> xatlas.Atlas:
+    """Return an atlas with a mesh for each group of faces, before it is packed."""
+    atlas = xatlas.Atlas()
+    for group in groups:
+        used, corners = np.unique(soup.faces[group], return_inverse=True)
+        atlas.add_mesh(
+            (soup.points[used] * _XATLAS_SCALE).astype(np.float32),
+            corners.reshape(-1, 3).astype(np.uint32),
+        )
     return atlas
 
 
@@ -287,8 +295,6 @@ def _make_cut_directions() -> Float64Array:
 def _halve_patches(centers: Float64Array, patch: IntArray, max_faces: int) -> IntArray:
     """Halve patches until each has at most `max_faces` faces.
 
-    A patch is cut across its longest axis, at the median of its faces' centers.
-
     Args:
         centers: (F, 3) centers of the faces.
         patch: (F,) number of the patch that each face is in.
@@ -303,14 +309,24 @@ def _halve_patches(centers: Float64Array, patch: IntArray, max_faces: int) -> In
     while remaining:
         group = remaining.pop()
         if len(group) > max_faces:
-            axis = np.ptp(centers[group], axis=0).argmax()
-            order = group[np.argsort(centers[group, axis], kind="stable")]
-            middle = len(order) // 2
-            remaining += [order[:middle], order[middle:]]
+            remaining += _halve_group(centers, group)
         else:
             piece_of_face[group] = n_pieces
             n_pieces += 1
     return piece_of_face
+
+
+def _halve_group(centers: Float64Array, group: IntArray) -> list[IntArray]:
+    """Cut a group of faces (n,) across its longest axis, at the median of the centers.
+
+    Args:
+        centers: (F, 3) centers of all faces.
+        group: (n,) indices of the faces of the group.
+    """
+    axis = np.ptp(centers[group], axis=0).argmax()
+    order = group[np.argsort(centers[group, axis], kind="stable")]
+    middle = len(order) // 2
+    return [order[:middle], order[middle:]]
 
 
 MAP_SIZE = 64  # cells along each side of the map
@@ -427,17 +443,23 @@ def _unwrap_mesh(mesh: Mesh) -> Float64Array:
     points = (mesh.vertices - lower).astype(np.float64) / extent
     unique_points, unique_index = np.unique(points, axis=0, return_inverse=True)
     faces = unique_index.reshape(-1)[mesh.faces.astype(np.int64)]
+    return unwrap(_make_bare_soup(unique_points, faces)).uvs
+
+
+def _make_bare_soup(points: Float64Array, faces: IntArray) -> TriangleSoup:
+    """Return faces (F, 3) of points (N, 3) as `unwrap` expects them.
+
+    `unwrap` uses points and faces alone: the other fields are fillers.
+    """
     n_faces = len(faces)
-    # `unwrap` uses points and faces alone: the other fields are fillers.
-    soup = TriangleSoup(
-        points=unique_points,
+    return TriangleSoup(
+        points=points,
         faces=faces,
         part_of_face=np.zeros(n_faces, np.int64),
         normals=np.full((n_faces, 3, 3), np.nan),
         uvs=np.full((n_faces, 3, 2), np.nan),
         colors=np.ones((n_faces, 3, 3)),
     )
-    return unwrap(soup).uvs
 
 
 def _rasterise_map(mesh: Mesh, uvs: Float64Array) -> Charts:

@@ -265,16 +265,10 @@ def load_sides(context: RunContext[CompareConfig]) -> tuple[list[Side], int]:
 def describe_sweeps(config: CompareConfig, sides: Sequence[Side]) -> dict[str, Any]:
     """Return the fields of the result that describe the compared sweeps.
 
-    Without sides, since the sweep was interrupted, they follow from the settings.
+    There are no sides if the sweep was interrupted.
     """
     if not sides:
-        return {
-            "environment": config.environment_name,
-            "controls": list(config.controls),
-            "object": config.object,
-            "model": config.compared,
-            "task": config.task_name,
-        }
+        return _describe_planned_sweep(config)
     environments = settings.join_names(side.sweep.summary.environment for side in sides)
     objects = settings.join_names(side.name_by_column["object"] for side in sides)
     models = settings.join_names(side.name_by_column["model"] for side in sides)
@@ -284,6 +278,17 @@ def describe_sweeps(config: CompareConfig, sides: Sequence[Side]) -> dict[str, A
         "object": objects or config.object,
         "model": models or config.compared,
         "task": sides[0].sweep.summary.task,
+    }
+
+
+def _describe_planned_sweep(config: CompareConfig) -> dict[str, Any]:
+    """Return the fields of the result that describe a sweep, from its settings."""
+    return {
+        "environment": config.environment_name,
+        "controls": list(config.controls),
+        "object": config.object,
+        "model": config.compared,
+        "task": config.task_name,
     }
 
 
@@ -318,15 +323,7 @@ def find_comparison_warnings(sides: Sequence[Side], differ: Sequence[str]) -> li
         return []
     warnings = [text for side in sides for text in side.sweep.summary.warnings]
     warnings += _find_setting_warnings(differ)
-    rows = sides[0].rows
-    # Rows of one unit, such as the frames of one drive, are not independent.
-    is_of_single_unit = rows["unit"].nunique() == 1
-    if len(rows) > 1 and is_of_single_unit:
-        unit_name = rows.attrs["unit name"]
-        warnings.append(
-            f"All pairs are of one {unit_name}: the fractions are those of this one, "
-            "and show nothing about others."
-        )
+    warnings += _find_unit_warnings(sides[0].rows)
     tasks = {side.sweep.summary.task for side in sides}
     if len(tasks) > 1:
         warnings.append(
@@ -351,4 +348,19 @@ def _find_setting_warnings(differ: Sequence[str]) -> list[str]:
     return [
         f"The sweeps differ in {names}: a difference between the sides may come "
         "from any of these."
+    ]
+
+
+def _find_unit_warnings(rows: Any) -> list[str]:
+    """Return a warning if several rows of a side are all of one unit, such as a drive.
+
+    Rows of one unit, such as the frames of one drive, are not independent.
+    """
+    is_of_single_unit = rows["unit"].nunique() == 1
+    if len(rows) <= 1 or not is_of_single_unit:
+        return []
+    unit_name = rows.attrs["unit name"]
+    return [
+        f"All pairs are of one {unit_name}: the fractions are those of this one, "
+        "and show nothing about others."
     ]

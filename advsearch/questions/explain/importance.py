@@ -226,11 +226,6 @@ class ClusteredPredictions:
         not known, or if there is a single group, the fraction is 0 and its interval 0
         to 1: nothing is known.
 
-        The interval follows from the statistic rows * fraction / design effect. It has
-        a noncentral chi-squared distribution (with clusters, a noncentral F, multiplied
-        by the degrees of freedom). Its noncentrality is rows * true fraction / design
-        effect: an interval of the noncentrality gives one of the true fraction.
-
         Args:
             factors: names of the factors.
             group: (n,) the group of each prediction, by the values of the factors.
@@ -243,20 +238,37 @@ class ClusteredPredictions:
                 parameters=factors, share=0.0, interval=(0.0, 1.0), parts=n_groups
             )
 
-        n_rows = len(self.correct)
         correction = self._correct_fraction(fraction, n_groups, chance_statistic)
+        return ParameterWeight(
+            parameters=factors,
+            share=max(correction.fraction, 0.0),
+            interval=self._estimate_fraction_interval(fraction, n_groups, correction),
+            parts=n_groups,
+        )
+
+    def _estimate_fraction_interval(
+        self, fraction: float, n_groups: int, correction: _Correction
+    ) -> tuple[float, float]:
+        """Return the 95 % interval of a fraction of the variance between groups.
+
+        It follows from the statistic rows * fraction / design effect. That has a
+        noncentral chi-squared distribution (with clusters, a noncentral F, multiplied
+        by the degrees of freedom). Its noncentrality is rows * true fraction / design
+        effect: an interval of the noncentrality gives one of the true fraction.
+
+        Args:
+            fraction: the explained fraction, before the correction.
+            n_groups: number of groups.
+            correction: its design effect and its degrees of freedom are used.
+        """
+        n_rows = len(self.correct)
         design_effect = correction.design_effect
         lower_noncentrality, upper_noncentrality = noncentrality_interval(
             n_rows * fraction / design_effect, n_groups - 1, correction.error_degrees
         )
         lower = min(design_effect * lower_noncentrality / n_rows, 1.0)
         upper = min(design_effect * upper_noncentrality / n_rows, 1.0)
-        return ParameterWeight(
-            parameters=factors,
-            share=max(correction.fraction, 0.0),
-            interval=(lower, upper),
-            parts=n_groups,
-        )
+        return lower, upper
 
     def _correct_fraction(
         self, fraction: float, n_groups: int, chance_statistic: float
@@ -317,6 +329,7 @@ class ClusteredPredictions:
 
         residual = self._weighted_residual(group, group_weight, is_used)
         cell_residual = np.bincount(cell.reshape(-1), residual)
+        # (groups,) sum over the cells of each group
         squared_residual = np.bincount(
             cell_group, cell_residual**2, minlength=len(group_weight)
         )

@@ -112,13 +112,23 @@ class SweepRunner:
         except InputError as error:
             self._warn_about_sweep(name, error)
             return None
-        sweep = workbench.StoredSweep.read(
-            RunDirectory.locate_part(self.context.run.path, name)
-        )
+        sweep = self._read_finished_part(name)
+        return None if self.interrupted else read_predictions([sweep])
+
+    def _read_finished_part(self, name: str) -> workbench.StoredSweep:
+        """Read a sweep that has ended, and count its renders.
+
+        `interrupted` is set if it ended by Ctrl-C.
+
+        Args:
+            name: name of the run in the directory of this experiment.
+        """
+        path = RunDirectory.locate_part(self.context.run.path, name)
+        sweep = workbench.StoredSweep.read(path)
         self._rendered[name] = sweep
         self.interrupted = sweep.summary.is_unfinished
         self.n_renders += sum(sweep.summary.renders.values())
-        return None if self.interrupted else read_predictions([sweep])
+        return sweep
 
     def _warn_about_sweep(self, name: str, error: InputError) -> None:
         """Add a warning that a sweep could not be rendered.
@@ -217,14 +227,10 @@ class SweepRunner:
             for arc in range(n_arcs):
                 rows = self._render_arc(index, rule, sweep_index, arc, samples)
                 # None after an interrupt, or if nothing could be rendered
-                if rows is None:
-                    continue
-                inside = select_inside(rows, rule.conditions, earlier_conditions)
-                # Draws of other sweeps may have the same indices: with this number
-                # their names differ, such as "12 of 3".
-                number = self._number_sweep(index, sweep_index, arc)
-                unit = inside["unit"].astype(str) + f" of {number}"
-                fresh_frames.append(inside.assign(unit=unit))
+                if rows is not None:
+                    inside = select_inside(rows, rule.conditions, earlier_conditions)
+                    number = self._number_sweep(index, sweep_index, arc)
+                    fresh_frames.append(_name_fresh_draws(inside, number))
         return fresh_frames
 
     def _number_sweep(self, index: int, sweep_index: int, arc: int) -> int:
@@ -302,15 +308,7 @@ class SweepRunner:
             index: index of the failure among the rows.
             conditions: conditions of the failure's rule.
         """
-        rule_factors = [condition.factor for condition in conditions]
-        other_factors = [
-            factor
-            for factor in self.factor_table.attrs["units"]
-            if factor not in rule_factors
-        ]
-        # groups to try: all factors of the rule, then each other factor by itself
-        factor_groups = [rule_factors, *([factor] for factor in other_factors)]
-        for factors in factor_groups:
+        for factors in self._group_factors(conditions):
             attempts = [
                 self._find_nearest_right(name, index, factor) for factor in factors
             ]
@@ -318,6 +316,16 @@ class SweepRunner:
             if pairs:
                 return min(pairs, key=self._relative_change)
         return None
+
+    def _group_factors(self, conditions: rules.RuleConditions) -> list[list[str]]:
+        """Return all factors of a rule as one group, then each other factor by itself."""
+        rule_factors = [condition.factor for condition in conditions]
+        other_factors = [
+            factor
+            for factor in self.factor_table.attrs["units"]
+            if factor not in rule_factors
+        ]
+        return [rule_factors, *([factor] for factor in other_factors)]
 
     def _relative_change(self, pair: NearestRight) -> float:
         """Return the difference of a pair as a fraction of the factor's range.
@@ -654,6 +662,15 @@ class SweepRunner:
             images.append(sweep.scenes.render_image(number))
             self.progress.advance(1)
         return torch.stack(images), compute_features
+
+
+def _name_fresh_draws(rows: pd.DataFrame, number: int) -> pd.DataFrame:
+    """Return rows of a sweep with names of their draws, such as "12 of 3".
+
+    Draws of other sweeps may have the same indices: with the sweep's number their names
+    differ.
+    """
+    return rows.assign(unit=rows["unit"].astype(str) + f" of {number}")
 
 
 def count_arcs(config: SweepConfig, conditions: rules.RuleConditions) -> int:

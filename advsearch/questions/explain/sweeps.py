@@ -61,12 +61,8 @@ def make_sweep_inside(
     }
     scene_settings = cut_scene_settings(config, values_inside)
     n_scenes = _count_scenes_of_settings(scene_settings)
-    # An axis that does not vary in the rows keeps its values.
-    full_grid = {
-        name: values_inside.get(name, values) for name, values in config.grid.items()
-    }
     # twice the number of samples, for all scenes together
-    grid = thin_grid(full_grid, max_points=2 * samples / n_scenes)
+    grid = cut_grid(config, values_inside, max_points=2 * samples / n_scenes)
     n_configurations = count_grid_points(grid) * n_scenes
     controls = cut_controls(config, table, conditions, arc)
     # number of draws at each point of the grid in each scene; None if nothing is
@@ -83,6 +79,24 @@ def _count_scenes_of_settings(scene_settings: Mapping[str, str | None]) -> int:
         len(settings.split_names(names)) if names else 1
         for names in scene_settings.values()
     )
+
+
+def cut_grid(
+    config: SweepConfig, values_inside: Mapping[str, Sequence[Any]], max_points: float
+) -> dict[str, Any]:
+    """Return the grid of a sweep, reduced to values under conditions and thinned.
+
+    An axis that does not vary in the rows keeps its values.
+
+    Args:
+        config: settings of the sweep.
+        values_inside: values that each factor has under the conditions.
+        max_points: largest number of points of the grid.
+    """
+    full_grid = {
+        name: values_inside.get(name, values) for name, values in config.grid.items()
+    }
+    return thin_grid(full_grid, max_points)
 
 
 def thin_grid(grid: Mapping[str, Any], max_points: float) -> dict[str, Any]:
