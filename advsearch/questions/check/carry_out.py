@@ -410,19 +410,30 @@ class GradientCheck:
             problem: problem of the scene.
             part: part of the check; its key names the stored measurements.
         """
-        config = part.config
         length = self.measurements.get_or_measure_row(
             f"{part.key} bounces",
             results.PathLength,
-            lambda: self._measure_path_length(problem, config.seed),
+            lambda: self._measure_path_length(problem, part.config.seed),
         )
         yield length
+        yield from self._measure_omissions(problem, part, length.depth)
+
+    def _measure_omissions(
+        self, problem: Problem, part: CheckedPart, depth: int
+    ) -> Iterator[Finding]:
+        """Yield what each omission saves, and then the visible texels of each texture.
+
+        Args:
+            problem: problem of the scene.
+            part: part of the check; its key names the stored measurements.
+            depth: segments of the longest light path of the search.
+        """
         u = gradients.find_interior_point(problem.renderer)
-        seed = seeds.derive_seed(config.seed, "leaving out")
+        seed = seeds.derive_seed(part.config.seed, "leaving out")
         yield from self.measurements.get_or_measure_rows(
             f"{part.key} gains",
             GainRow,
-            lambda: self._measure_gains(problem, u, seed, length.depth),
+            lambda: self._measure_gains(problem, u, seed, depth),
         )
         yield from self.measurements.get_or_measure_rows(
             f"{part.key} texels",
@@ -515,6 +526,23 @@ def _select(findings: Sequence[Finding], kind: type[FindingType]) -> list[Findin
 def list_left_out(renderer: gradients.Renderer) -> list[str]:
     """Return what a search with the renderer's plan does not compute, in sentences."""
     estimators = {group.estimator for group in renderer.plan.groups}
+    sentences = _list_unneeded_renders(estimators)
+    if not renderer.scene.is_volumetric:
+        sentences.append("the volumetric integrator: there is no medium")
+    if "material" in estimators:
+        # effects that this estimator ignores or approximates
+        sentences += [
+            f"by the material form: {limit}" for limit in renderer.scene.material_limits
+        ]
+    return sentences
+
+
+def _list_unneeded_renders(estimators: set[str]) -> list[str]:
+    """Return what derivatives by some estimators do not need, in sentences.
+
+    Args:
+        estimators: the estimators of all groups of coordinates.
+    """
     sentences = []
     # Of all adjoints, only the estimator "material" differentiates moving outlines.
     if "material" not in estimators:
@@ -528,11 +556,4 @@ def list_left_out(renderer: gradients.Renderer) -> list[str]:
             "renders for differences: every derivative comes from an adjoint or from "
             "the picture itself"
         )
-    if not renderer.scene.is_volumetric:
-        sentences.append("the volumetric integrator: there is no medium")
-    if "material" in estimators:
-        # effects that this estimator ignores or approximates
-        sentences += [
-            f"by the material form: {limit}" for limit in renderer.scene.material_limits
-        ]
     return sentences

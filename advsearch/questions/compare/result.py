@@ -336,15 +336,7 @@ def _make_parameter_tables(pair: ComparedPair) -> Iterator[ResultPart]:
     """
     parts_by_title = _group_parts(pair.parts)
     titles_in_terminal = _find_most_varying(parts_by_title)
-    heads = [
-        "",
-        "pairs",
-        pair.first,
-        pair.second,
-        "difference, points (95 % interval)",
-        f"{pair.first} alone",
-        f"{pair.second} alone",
-    ]
+    heads = _list_part_heads(pair)
     for title, parts in parts_by_title.items():
         rows = [_make_part_cells(part) for part in parts]
         # An empty `only` shows the table on the page and in a terminal.
@@ -357,6 +349,19 @@ def _make_parameter_tables(pair: ComparedPair) -> Iterator[ResultPart]:
             f"{n_parameters} parameters."
         )
         yield ResultPart(text=[remark], only_medium="text")
+
+
+def _list_part_heads(pair: ComparedPair) -> list[str]:
+    """Return the heads of the columns of a parameter's table; see `_make_part_cells`."""
+    return [
+        "",
+        "pairs",
+        pair.first,
+        pair.second,
+        "difference, points (95 % interval)",
+        f"{pair.first} alone",
+        f"{pair.second} alone",
+    ]
 
 
 def _group_parts(parts: Sequence[PairPart]) -> dict[str, list[PairPart]]:

@@ -133,11 +133,8 @@ def list_peels(
             if smaller != condition and not is_empty:
                 conditions = {**condition_of_factor, factor: smaller}
                 # in the order of the factors, and not in that of the peels
-                yield tuple(
-                    conditions[name]
-                    for name in inside.attrs["units"]
-                    if name in conditions
-                )
+                factors = [name for name in inside.attrs["units"] if name in conditions]
+                yield tuple(conditions[name] for name in factors)
 
 
 def list_factor_peels(

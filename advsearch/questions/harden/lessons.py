@@ -220,7 +220,6 @@ def _make_texture_lessons(
         seed: root of the samples.
         shares_texture: whether all views share one texture.
     """
-    domain = problem.domain
     # The lessons stay in memory during the full training, so they have spaces without
     # the scene, which is large.
     full_space = replace(problem.space, scene=None)
@@ -228,18 +227,35 @@ def _make_texture_lessons(
         TextureLesson,
         right_classes=_find_right_classes(problem),
         space=replace(problem.searched_space, scene=None),
-        domain=domain,
+        domain=problem.domain,
     )
-    shared_texture = _sample_texture(domain, seed)
-    texture_lessons = []
-    for number in range(views):
-        view_seed = seeds.derive_seed(seed, "lesson", number)
-        texture = shared_texture
-        if not shares_texture:
-            texture = _sample_texture(domain, view_seed)
-        view_fields = _make_view_fields(problem, full_space, view_seed)
-        texture_lessons.append(make_lesson(texture=texture, **view_fields))
-    return texture_lessons
+    view_seeds = [seeds.derive_seed(seed, "lesson", number) for number in range(views)]
+    textures = _sample_textures(problem.domain, seed, view_seeds, shares_texture)
+    return [
+        make_lesson(
+            texture=texture, **_make_view_fields(problem, full_space, view_seed)
+        )
+        for texture, view_seed in zip(textures, view_seeds, strict=True)
+    ]
+
+
+def _sample_textures(
+    domain: policies.Domain,
+    seed: int,
+    view_seeds: Sequence[int],
+    shares_texture: bool,
+) -> list[Tensor]:
+    """Sample the first texture (d,) of each view of a scene.
+
+    Args:
+        domain: the searched space with its bounds.
+        seed: seed of the texture that all views share.
+        view_seeds: seeds of the textures of views that share none.
+        shares_texture: whether all views get one tensor.
+    """
+    if shares_texture:
+        return [_sample_texture(domain, seed)] * len(view_seeds)
+    return [_sample_texture(domain, view_seed) for view_seed in view_seeds]
 
 
 def _make_view_fields(problem: Problem, full_space: Any, seed: int) -> dict[str, Any]:

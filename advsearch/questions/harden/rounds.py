@@ -167,11 +167,7 @@ class Trainer(ABC):
             parameters, self.count_steps(training_items)
         )
         average = [parameter.detach().clone() for parameter in parameters]
-        # `_iterate_batches` shuffles an epoch when it begins. Gradients draw from the same
-        # generator in between.
-        rng = np.random.default_rng(
-            [seeds.derive_seed(self.config.seed, "order"), number]
-        )
+        rng = self._make_order_generator(number)
         with self.open_gradient_context(new) as compute_gradient:
             batches = self._iterate_batches(training_items, rng)
             for n_steps, batch in enumerate(batches, start=1):
@@ -180,6 +176,15 @@ class Trainer(ABC):
                 self._update_average(n_steps, average, parameters)
                 tick()
         _copy_average(average, parameters)
+
+    def _make_order_generator(self, number: int) -> np.random.Generator:
+        """Return the random generator of a round.
+
+        It shuffles each epoch when the epoch begins (`_iterate_batches`). In between,
+        gradients sample from it.
+        """
+        order_seed = seeds.derive_seed(self.config.seed, "order")
+        return np.random.default_rng([order_seed, number])
 
     def _iterate_batches(
         self, pool: Sequence[Any], rng: np.random.Generator

@@ -399,16 +399,28 @@ class SceneJobs:
             run_settings = workbench.select_run_settings(
                 self.config, control, control_settings
             )
-            used_settings = {
-                name: value for name, value in run_settings.items() if value is not None
-            }
-            # Settings that no control takes get the value None. Entries of a setting that
-            # is a mapping by control, such as `epsilon`, are merged.
-            none_by_name = dict.fromkeys(run_settings)
-            selected = settings.merge_mappings(
-                {**none_by_name, **selected}, used_settings
-            )
+            selected = _add_used_settings(selected, run_settings)
         return selected
+
+
+def _add_used_settings(
+    selected: Mapping[str, Any], run_settings: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return selected settings together with those that a control takes.
+
+    Settings that no control takes get the value None. Entries of a setting that is a
+    mapping by control, such as `epsilon`, are merged.
+
+    Args:
+        selected: settings that other controls take.
+        run_settings: all such settings of the run; None if the control does not take
+            one.
+    """
+    used_settings = {
+        name: value for name, value in run_settings.items() if value is not None
+    }
+    none_by_name = dict.fromkeys(run_settings)
+    return settings.merge_mappings({**none_by_name, **selected}, used_settings)
 
 
 def _add_evaluation(
@@ -542,9 +554,7 @@ class SceneSplit:
             light = vary_environment(description.environment, rng)
             light = change_white_light(light, rng)
             description = replace(description, environment=light)
-        if description.object.label is None:
-            labelled_object = replace(description.object, label=_name_class(name))
-            description = replace(description, object=labelled_object)
+        description = _label_object(description, name)
         is_changed = description is not scene.description
         return name, workbench.Scene(description) if is_changed else scene
 
@@ -588,6 +598,14 @@ class SceneSplit:
             elif is_first_time:
                 _, scene = self.load_scene(number)
                 yield scene.description.object
+
+
+def _label_object(description: Any, file: str) -> Any:
+    """Return a description whose object has a label: without one, that of its file."""
+    if description.object.label is not None:
+        return description
+    labelled_object = replace(description.object, label=_name_class(file))
+    return replace(description, object=labelled_object)
 
 
 def _name_class(file: str) -> str:

@@ -437,9 +437,7 @@ class GradientComputer:
         for parameter, *part_gradients in zip(
             self._student.parameters(), *gradients, strict=True
         ):
-            # None: the part's loss does not depend on the parameter
-            used = [gradient for gradient in part_gradients if gradient is not None]
-            parameter.grad = torch.stack(used).sum(dim=0) if used else None
+            parameter.grad = _sum_gradients(part_gradients)
 
     def _make_part_gradient(
         self, batch: Sequence[Lesson]
@@ -572,7 +570,8 @@ class GradientComputer:
             divergence = self._divergence_from_original(
                 images[unrendered], logits[unrendered], unrendered_classes
             )
-            loss = loss + plain_weight * ORIGINAL_MODEL_WEIGHT * divergence
+            divergence_weight = plain_weight * ORIGINAL_MODEL_WEIGHT
+            loss = loss + divergence_weight * divergence
         return loss
 
     def _divergence_from_original(
@@ -597,6 +596,15 @@ class GradientComputer:
             reduction="sum",
             log_target=True,
         )
+
+
+def _sum_gradients(part_gradients: Sequence[Tensor | None]) -> Tensor | None:
+    """Return the sum of the gradients of a parameter; None if no part has one.
+
+    A part whose loss does not depend on the parameter has None.
+    """
+    used = [gradient for gradient in part_gradients if gradient is not None]
+    return torch.stack(used).sum(dim=0) if used else None
 
 
 def _put_textures_first(batch: Sequence[Lesson]) -> list[Lesson]:

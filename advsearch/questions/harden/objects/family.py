@@ -143,7 +143,7 @@ def pack_charts(
     Raises:
         ValueError: there are too many charts for their gutters alone.
     """
-    # Rounded, as machines differ in the last bits: all of them get the same packing.
+    # Machines differ in the last bits: with rounded sizes all get the same packing.
     exact_sizes = [
         (round(width, DECIMALS), round(height, DECIMALS)) for width, height in sizes
     ]
@@ -386,7 +386,7 @@ class ObjectFamily:
         return self.name.replace("-", " ")
 
     def generate(self, rng: np.random.Generator | None) -> assets.ObjectAsset:
-        """Return the canonical instance, or a random one.
+        """Return the canonical instance, or a random one, as an asset.
 
         The mesh has a largest extent of 1 and stands on z = 0. The same state of the
         generator gives the same asset.
@@ -395,9 +395,7 @@ class ObjectFamily:
             rng: random generator that all parameters are sampled from; None for the
                 canonical instance.
         """
-        instance = self.make_instance(ParameterSampler(rng))
-        if instance.materials_by_tag:
-            instance = _sort_by_material(instance)
+        instance = self._make_sorted_instance(rng)
         rectangles = pack_charts(_scale_charts(instance), self.atlas_size)
         mesh = join_patches(instance.patches, rectangles, self.atlas_size)
         surface: dict[str, object] | None = None
@@ -418,6 +416,14 @@ class ObjectFamily:
             size_in_metres=self._measure_size(instance),
             drives=instance.drives,
         )
+
+    def _make_sorted_instance(self, rng: np.random.Generator | None) -> Instance:
+        """Build the canonical instance (None) or a random one.
+
+        If it has several materials, its patches are sorted by them.
+        """
+        instance = self.make_instance(ParameterSampler(rng))
+        return _sort_by_material(instance) if instance.materials_by_tag else instance
 
     def _measure_size(self, instance: Instance) -> float:
         """Return the largest extent of an instance in metres."""
