@@ -360,11 +360,7 @@ def _read_entry(spec: str, index: int, entry: Any) -> RigCamera:
             f"{where}: expected entries among {', '.join(ENTRY_KEYS)}, got "
             f"{str(entry)[:80]!r}"
         )
-    name = entry.get("name", f"camera {index + 1}")
-    if not isinstance(name, str) or not 0 < len(name) <= 40:
-        raise FileFormatError(
-            f"{where}: name: expected a short text, got {str(name)[:80]!r}"
-        )
+    name = _check_camera_name(where, entry.get("name", f"camera {index + 1}"))
     pose = _read_entry_pose(where, entry)
     (orbit_angle,) = _parse_numbers(
         where, "around", [entry.get("around", 0.0)], 1, MAX_TURN
@@ -372,6 +368,23 @@ def _read_entry(spec: str, index: int, entry: Any) -> RigCamera:
     fov = _read_entry_fov(where, entry["fov"]) if "fov" in entry else None
     delay = _read_entry_delay(where, entry)
     return RigCamera(name=name, pose=pose, azimuth=orbit_angle, fov=fov, delay=delay)
+
+
+def _check_camera_name(where: str, name: Any) -> str:
+    """Return the name of an entry of our own format, which has to be a short text.
+
+    Args:
+        where: file and camera, for messages.
+        name: the value of `name`, or a default.
+
+    Raises:
+        FileFormatError: it is empty, too long, or no text.
+    """
+    if not isinstance(name, str) or not 0 < len(name) <= 40:
+        raise FileFormatError(
+            f"{where}: name: expected a short text, got {str(name)[:80]!r}"
+        )
+    return name
 
 
 def _read_entry_fov(where: str, value: Any) -> float:

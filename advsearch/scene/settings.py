@@ -724,15 +724,25 @@ def resolve_settings(settings: SettingValues) -> dict[str, float | None]:
         for name, parameter in SETTINGS.items()
     }
     for name, value in settings.items():
-        setting = find_parameter(name)
-        if setting is None:
-            raise UnknownNameError(
-                "scene parameter", name, SETTINGS, "Write it as `set` NAME=VALUE."
-            )
-        if setting.options:
-            value = _find_option_index(name, setting.options, value)
-        values[name] = _convert_number(name, setting, value)
+        values[name] = _convert_setting(name, value)
     return values
+
+
+def _convert_setting(name: str, value: object) -> float:
+    """Return the number of a setting; that of a choice is the index of its option.
+
+    Raises:
+        InputError: the value is not valid for the setting.
+        UnknownNameError: there is no such setting.
+    """
+    setting = find_parameter(name)
+    if setting is None:
+        raise UnknownNameError(
+            "scene parameter", name, SETTINGS, "Write it as `set` NAME=VALUE."
+        )
+    if setting.options:
+        value = _find_option_index(name, setting.options, value)
+    return _convert_number(name, setting, value)
 
 
 def _find_option_index(name: str, options: tuple[str, ...], value: object) -> int:

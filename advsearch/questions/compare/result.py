@@ -531,6 +531,23 @@ def _make_pair_claim(
         second: its second side.
         task: the task that evaluates the predictions.
     """
+    extent = results.Extent.from_count(
+        f"configurations in which {pair.second} is right",
+        second.correct,
+        second.configurations,
+        second.interval,
+        second.accuracy,
+        counts_right=True,
+    )
+    statement = _state_difference(pair, second, task)
+    return views.Claim(kind="measured", statement=statement, extent=extent)
+
+
+def _state_difference(pair: ComparedPair, second: ComparedSide, task: str) -> str:
+    """State the difference of a pair, and what its second side gets wrong.
+
+    The arguments are those of `_make_pair_claim`.
+    """
     # Without units, pairs are independent.
     method = "Newcombe's, of pairs" if pair.units is None else f"over {pair.unit}s"
     statement = (
@@ -540,12 +557,4 @@ def _make_pair_claim(
     outcomes = wording.format_outcomes(second.outcomes, task)
     if outcomes:
         statement += f" Of the others {pair.second} has {outcomes}."
-    extent = results.Extent.from_count(
-        f"configurations in which {pair.second} is right",
-        second.correct,
-        second.configurations,
-        second.interval,
-        second.accuracy,
-        counts_right=True,
-    )
-    return views.Claim(kind="measured", statement=statement, extent=extent)
+    return statement

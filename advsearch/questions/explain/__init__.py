@@ -254,17 +254,26 @@ def read_table(
 
     rows = read_predictions(sweeps)
     rows = rows[rules.is_in_view(rows)].reset_index(drop=True)
-    if len(rows) < rules.MIN_ROWS:
-        raise InputError(
-            f"explain: expected at least {rules.MIN_ROWS} rows, got {len(rows)}; sweep "
-            "more configurations"
-        )
+    _check_row_count(rows, rules.MIN_ROWS)
     table = rules.make_table(rows, rows.attrs["units"])
     if not table.attrs["units"]:
         raise InputError(
             "explain: expected a parameter that varies and that all rows have, got none"
         )
     return rows, table
+
+
+def _check_row_count(rows: pd.DataFrame, n_needed: int) -> None:
+    """Check that there are enough rows.
+
+    Raises:
+        InputError: there are fewer.
+    """
+    if len(rows) < n_needed:
+        raise InputError(
+            f"explain: expected at least {n_needed} rows, got {len(rows)}; sweep "
+            "more configurations"
+        )
 
 
 def find_sweeps(path: Path) -> list[Path]:

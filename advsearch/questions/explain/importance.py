@@ -162,6 +162,20 @@ class _Correction(NamedTuple):
     error_degrees: float
 
 
+class _Cells(NamedTuple):
+    """What groups and clusters of predictions have in common.
+
+    Attributes:
+        index: the cell of each prediction (n,).
+        group: the group of each cell (cells,).
+        cluster: the cluster of each cell (cells,).
+    """
+
+    index: IntArray
+    group: IntArray
+    cluster: IntArray
+
+
 class ClusteredPredictions:
     """Right and wrong predictions in clusters, such as drives, of equal weight.
 
@@ -302,11 +316,8 @@ class ClusteredPredictions:
         1). With clusters, it is (groups - 1) times the design effect (Rao and Scott
         1981, section 3).
 
-        With clusters, the sum over groups has this expectation: the sum over groups of
-        weight * variance of the group's rate, minus rows * variance of the overall
-        rate. Both variances are estimated from the residuals of clusters. The result is
-        at least `MIN_INFLATION` times (groups - 1). It is NaN if a group has fewer than
-        two clusters.
+        The result is at least `MIN_INFLATION` times (groups - 1). It is NaN if a group
+        has fewer than two clusters.
 
         Args:
             group: (n,) the group of each prediction.
@@ -317,30 +328,54 @@ class ClusteredPredictions:
         if self.is_independent:
             return float(n_groups - 1)
 
-        # A cell is what a cluster and a group have in common; `cell` (n,) is the index
-        # of the cell of each prediction.
-        cell_id, cell = np.unique(
-            group * self.n_clusters + self.cluster, return_inverse=True
-        )
-        cell_group, cell_cluster = np.divmod(cell_id, self.n_clusters)  # (cells,) each
-        clusters_per_group = np.bincount(cell_group, minlength=len(group_weight))
+        cells = self._divide_into_cells(group)
+        clusters_per_group = np.bincount(cells.group, minlength=len(group_weight))
         if not self._has_enough_clusters(n_groups, clusters_per_group[is_used]):
             return math.nan
+        excess = self._estimate_excess(group, group_weight, cells, clusters_per_group)
+        return max(excess, MIN_INFLATION * float(n_groups - 1))
 
+    def _divide_into_cells(self, group: IntArray) -> _Cells:
+        """Return the cells of predictions, by their groups (n,) and their clusters."""
+        cell_id, index = np.unique(
+            group * self.n_clusters + self.cluster, return_inverse=True
+        )
+        cell_group, cell_cluster = np.divmod(cell_id, self.n_clusters)
+        return _Cells(index.reshape(-1), cell_group, cell_cluster)
+
+    def _estimate_excess(
+        self,
+        group: IntArray,
+        group_weight: npt.NDArray[Any],
+        cells: _Cells,
+        clusters_per_group: IntArray,
+    ) -> float:
+        """Estimate the expected statistic of a factor without effect from clusters.
+
+        It is the sum over groups of weight * variance of the group's rate, minus rows *
+        variance of the overall rate, divided by the variance of a prediction. The
+        variances of the rates are estimated from the residuals of clusters.
+
+        Args:
+            group: (n,) the group of each prediction.
+            group_weight: (groups,) sum of the weights; 0 for a group that is not used.
+            cells: cells of the groups and the clusters.
+            clusters_per_group: (groups,) number of clusters of each group.
+        """
+        is_used = group_weight > 0
         residual = self._weighted_residual(group, group_weight, is_used)
-        cell_residual = np.bincount(cell.reshape(-1), residual)
+        cell_residual = np.bincount(cells.index, residual)
         # (groups,) sum over the cells of each group
         squared_residual = np.bincount(
-            cell_group, cell_residual**2, minlength=len(group_weight)
+            cells.group, cell_residual**2, minlength=len(group_weight)
         )
         within_groups = within_group_variance(
             squared_residual[is_used],
             clusters_per_group[is_used],
             group_weight[is_used],
         )
-        between_clusters = self._between_cluster_variance(cell_cluster, cell_residual)
-        excess = (within_groups - between_clusters) / self.variance
-        return max(excess, MIN_INFLATION * float(n_groups - 1))
+        between_clusters = self._between_cluster_variance(cells.cluster, cell_residual)
+        return float((within_groups - between_clusters) / self.variance)
 
     def _has_enough_clusters(self, n_groups: int, clusters_per_group: IntArray) -> bool:
         """Return whether the variances of rates can be estimated from clusters.

@@ -265,16 +265,20 @@ def make_explain_view(result: ExplainResult) -> ShownResult:
         ResultPart("Where it can be relied on", [describe_envelope(result)]),
         *_make_failure_parts(result),
     ]
+    about = [result.object, result.model]
+    return ShownResult(_make_headline(result), sections, _list_row_facts(result), about)
+
+
+def _list_row_facts(result: ExplainResult) -> dict[str, str]:
+    """Return the rows, the sweeps and the parameters, by what they are."""
     # None if each row is an independent draw
     draws = f", of {result.units:,} independent draws" if result.units else ""
-    facts = {
+    return {
         # for example "right in 88 % (84 to 91) of 340, of 20 independent draws"
         "rows": f"right in {result.text}{draws}",
         "sweeps": ", ".join(result.sweeps),
         "parameters": ", ".join(result.parameters),
     }
-    about = [result.object, result.model]
-    return ShownResult(_make_headline(result), sections, facts, about)
 
 
 def _make_rules_part(result: ExplainResult) -> ResultPart:

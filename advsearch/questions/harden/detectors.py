@@ -182,9 +182,9 @@ def _read_coco_examples(
     examples = []
     for image in coco["images"]:
         file = _locate_image(image_directory, str(image["file_name"]), path)
-        levels = _read_levels(file, image)
+        image_uint8 = _read_levels(file, image)
         boxes, labels = _read_boxes(annotations_of_image, image, label_of_category)
-        examples.append(Example(image_uint8=levels, boxes=boxes, labels=labels))
+        examples.append(Example(image_uint8=image_uint8, boxes=boxes, labels=labels))
     return examples
 
 

@@ -370,20 +370,24 @@ def _make_robustness_part(result: HardenResult) -> ResultPart:
         [name, *_share_cells(before), *_share_cells(after)]
         for name, (before, after) in shares.items()
     ]
-    chart: dict[str, Any] = {}
-    if shares:
-        chart = {
-            "draw": partial(_draw_shares, shares=shares, model=result.model),
-            "size": (6.4, 1.4 + 0.45 * len(shares)),
-        }
     return ResultPart(
         "Before and after",
         column_heads=HEADS,
         rows=rows,
         note=ROBUST_NOTE,
         height=110 + 44 * len(shares),
-        **chart,
+        **_make_share_chart(shares, result.model),
     )
+
+
+def _make_share_chart(shares: ShareChanges, model: str) -> dict[str, Any]:
+    """Return the fields of a part with a chart of fractions; none without fractions."""
+    if not shares:
+        return {}
+    return {
+        "draw": partial(_draw_shares, shares=shares, model=model),
+        "size": (6.4, 1.4 + 0.45 * len(shares)),
+    }
 
 
 def _list_shares(
@@ -443,11 +447,23 @@ def _summarize(result: HardenResult) -> str:
         f"of {clean_after.count} plain pictures {clean_after.right} are right, before "
         f"{clean_before.right}."
     )
-    for when, share in (("Now", clean_after), ("Before", clean_before)):
-        outcomes = wording.format_outcomes(share.outcomes, result.task)
-        if outcomes:
-            text += f" {when}, the other plain pictures are {outcomes}."
+    text += _describe_plain_outcomes("Now", clean_after, result.task)
+    text += _describe_plain_outcomes("Before", clean_before, result.task)
     return text + _describe_changed_scenes(result)
+
+
+def _describe_plain_outcomes(when: str, share: Share, task: str) -> str:
+    """Describe what becomes of the object in plain images that are not right.
+
+    The result begins with a space; it is empty if nothing is known about that.
+
+    Args:
+        when: "Now" or "Before".
+        share: the fraction of plain images that are right.
+        task: the task that evaluates the predictions.
+    """
+    outcomes = wording.format_outcomes(share.outcomes, task)
+    return f" {when}, the other plain pictures are {outcomes}." if outcomes else ""
 
 
 def _describe_changed_scenes(result: HardenResult) -> str:

@@ -23,6 +23,7 @@ from advsearch.extend import (
     Model,
     Problem,
     Progress,
+    SceneDescription,
     assets,
     results,
     seeds,
@@ -600,7 +601,7 @@ class SceneSplit:
                 yield scene.description.object
 
 
-def _label_object(description: Any, file: str) -> Any:
+def _label_object(description: SceneDescription, file: str) -> SceneDescription:
     """Return a description whose object has a label: without one, that of its file."""
     if description.object.label is not None:
         return description

@@ -396,9 +396,8 @@ def _profile_normals(polylines: Sequence[Array]) -> list[Array]:
     all_directions = [_profile_directions(polyline) for polyline in polylines]
     min_smooth_cosine = np.cos(np.radians(HARD_ANGLE))
     for index in range(len(polylines) - 1):
-        end_point = polylines[index][-1]
-        next_point = polylines[index + 1][0]
-        is_joined = float(np.linalg.norm(end_point - next_point)) < 1e-9
+        gap = polylines[index][-1] - polylines[index + 1][0]
+        is_joined = float(np.linalg.norm(gap)) < 1e-9  # up to rounding
         end_direction = all_directions[index][-1]
         next_direction = all_directions[index + 1][0]
         is_smooth = float(end_direction @ next_direction) > min_smooth_cosine
@@ -580,13 +579,14 @@ def _wall(tag: str, profile: Array, normals: Array, columns: int) -> list[Patch]
     piece_columns = columns // n_pieces
     across = np.arange(piece_columns + 1) / piece_columns
     size = (width / n_pieces, length)
-    patches = []
-    for start in range(0, piece_columns * n_pieces, piece_columns):
-        piece = np.s_[:, start : start + piece_columns + 1]
-        patches.append(
-            make_grid_patch(tag, points[piece], normal[piece], size, down, across)
-        )
-    return patches
+    pieces = [
+        np.s_[:, start : start + piece_columns + 1]
+        for start in range(0, piece_columns * n_pieces, piece_columns)
+    ]
+    return [
+        make_grid_patch(tag, points[piece], normal[piece], size, down, across)
+        for piece in pieces
+    ]
 
 
 def _count_wall_charts(width: float, length: float, columns: int) -> int:
@@ -973,9 +973,7 @@ def make_cap_face(tag: str, ring: Array, normal: Array) -> Patch:
     the ring.
     """
     center = ring.mean(axis=0)
-    # axes of the plane; the first is made exactly perpendicular to the normal
-    to_first = normalize(ring[0] - center)
-    x_axis = normalize(to_first - (to_first @ normal) * normal)
+    x_axis = _make_perpendicular(normalize(ring[0] - center), normal)
     y_axis = np.cross(normal, x_axis)
     plane_points = np.stack(
         [(ring - center) @ x_axis, (ring - center) @ y_axis], axis=1
@@ -994,6 +992,11 @@ def make_cap_face(tag: str, ring: Array, normal: Array) -> Patch:
         size=(float(chart.extent[0]), float(chart.extent[1])),
         compute_rest_points=chart.compute_points,
     )
+
+
+def _make_perpendicular(direction: Array, normal: Array) -> Array:
+    """Return a unit direction (3,) made exactly perpendicular to a unit normal (3,)."""
+    return normalize(direction - (direction @ normal) * normal)
 
 
 @dataclass(frozen=True, eq=False)

@@ -153,13 +153,11 @@ def hammer(sampler: ParameterSampler) -> Instance:
     head = _hammer_head(sampler, style, half_head, half_eye, front, face_radius)
     half_grip, handle = _hammer_handle(sampler, half_head, length)
 
-    # It lies on the head and on the swelling of the handle, at 0.8 of its length. The
-    # head is thicker: the handle is tilted down by the difference. The factors are those
-    # of `_sledge_block`, nearly, and of `_eye_block`.
+    # half the thickness of the head; the factors are those of `_sledge_block`, nearly,
+    # and of `_eye_block`
     half_face = face_radius * 1.2 if style == "sledge" else face_radius
     drop = max(half_head * 1.05, half_face) - half_grip
-    tilt = -float(np.degrees(np.arctan2(drop, 0.8 * length)))
-    lay = shapes.make_rotation_matrix("y", tilt)
+    lay = shapes.make_rotation_matrix("y", _compute_hammer_tilt(drop, length))
     turn = shapes.make_rotation_matrix("z", sampler(58.0, low=20.0, high=90.0))
     lying = shapes.transform_patches([*head, *handle], lay)
     return Instance(
@@ -167,6 +165,18 @@ def hammer(sampler: ParameterSampler) -> Instance:
         _hammer_paints(sampler, front, length),
         sample_material(sampler, roughness=0.38, clearcoat=0.2),
     )
+
+
+def _compute_hammer_tilt(drop: float, length: float) -> float:
+    """Return the angle in degrees by which the handle of a lying hammer is tilted down.
+
+    The hammer lies on the head and on the swelling of the handle, at 0.8 of its length.
+
+    Args:
+        drop: by how much the head is thicker there, on one side.
+        length: length of the handle.
+    """
+    return -float(np.degrees(np.arctan2(drop, 0.8 * length)))
 
 
 def _hammer_head(
@@ -194,14 +204,27 @@ def _hammer_head(
         return _sledge_block(sampler, front, face_radius)
     block = _eye_block(half_head, half_eye)
     face = _striking_face(half_head, half_eye, front, face_radius)
+    back = _sample_hammer_back(sampler, style, half_head, half_eye)
+    return block + face + back
+
+
+def _sample_hammer_back(
+    sampler: ParameterSampler, style: str, half_head: float, half_eye: float
+) -> list[Patch]:
+    """Create what is behind the eye of a hammer: a claw or a peen of random length.
+
+    Args:
+        sampler: samples its shape.
+        style: "claw" or "peen".
+        half_head: half the width of the block around the eye.
+        half_eye: half the length of that block, about.
+    """
     if style == "claw":
         length = sampler(6.4, low=5.0, high=7.5)
         drop = sampler(2.6, low=1.2, high=3.6)
-        back = _claw(sampler, half_head, half_eye * 0.95, length, drop)
-    else:
-        length = sampler(4.0, low=3.0, high=5.0)
-        back = _peen(sampler, half_head, half_eye, length)
-    return block + face + back
+        return _claw(sampler, half_head, half_eye * 0.95, length, drop)
+    length = sampler(4.0, low=3.0, high=5.0)
+    return _peen(sampler, half_head, half_eye, length)
 
 
 def _sledge_block(
@@ -298,15 +321,21 @@ def _hammer_handle(
     top_x = half_head * 1.18  # the end that sticks out of the head
     # from there to -`length`
     path = np.stack([top_x - (length + top_x) * t, 0 * t, 0 * t], axis=1)
-    # Sections reach from -1 to 1, and are multiplied by `scale`.
-    if sampler.sample_bool(0.6, canonical=True):
-        section = shapes.ellipse(1.0, 1.0, count=24)
-    else:
-        section = shapes.rectangle(2.0, 2.0, bevel=0.7)
+    section = _sample_grip_section(sampler)  # is multiplied by `scale`
     handle = shapes.sweep_section(
         "handle", path, section, scale, start_axis=(0.0, 1.0, 0.0)
     )
     return half_thickness * (1.0 + swelling), handle
+
+
+def _sample_grip_section(sampler: ParameterSampler) -> Array:
+    """Sample the section (M, 2) of a handle: an ellipse, or a rounded square.
+
+    It reaches from -1 to 1 on both axes.
+    """
+    if sampler.sample_bool(0.6, canonical=True):
+        return shapes.ellipse(1.0, 1.0, count=24)
+    return shapes.rectangle(2.0, 2.0, bevel=0.7)
 
 
 def _handle_scale(
@@ -532,15 +561,18 @@ def dumbbell(sampler: ParameterSampler) -> Instance:
     other_weight = shapes.transform_patches(
         weight, shapes.make_rotation_matrix("y", 180.0)
     )
-    upright = bar + weight + other_weight
-    lying = shapes.transform_patches(upright, shapes.make_rotation_matrix("y", 90.0))
-    patches = shapes.transform_patches(
-        lying, shapes.make_rotation_matrix("z", sampler(118.0, low=90.0, high=150.0))
-    )
+    patches = _lay_dumbbell(sampler, bar + weight + other_weight)
     paints = _dumbbell_paints(sampler, style, half_grip, length, radius)
     return Instance(
         patches, paints, sample_material(sampler, roughness=0.42, clearcoat=0.2)
     )
+
+
+def _lay_dumbbell(sampler: ParameterSampler, upright: list[Patch]) -> list[Patch]:
+    """Return a dumbbell that lies in a random direction, from one along the z axis."""
+    lying = shapes.transform_patches(upright, shapes.make_rotation_matrix("y", 90.0))
+    turn = shapes.make_rotation_matrix("z", sampler(118.0, low=90.0, high=150.0))
+    return shapes.transform_patches(lying, turn)
 
 
 def _dumbbell_bar(sampler: ParameterSampler, half_grip: float) -> list[Patch]:
