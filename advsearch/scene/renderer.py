@@ -689,7 +689,8 @@ class Renderer:
         """
         renders_before = self.n_renders
         # without a rig there is one camera, with no mount
-        mounts = self.scene.description_and_filter[0].rig or (None,)
+        rig = self.scene.description_and_filter[0].rig
+        mounts: Sequence[RigCamera | None] = rig or (None,)
         images = list[Tensor]()
         for index, mount in enumerate(mounts):
             camera_seed = _derive_camera_seed(seed, index)

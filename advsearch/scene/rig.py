@@ -104,13 +104,18 @@ class RigCamera:
         # from the right: from the mount to the first camera, to the world, and around
         to_world = self._compute_orbit_rotation(center) @ first_to_world @ mount_pose
         camera_inputs = {**inputs, "camera.to_world": to_world}
+        return {**camera_inputs, **self._make_lens_inputs()}
+
+    def _make_lens_inputs(self) -> dict[str, Tensor]:
+        """Return the scene inputs of the mount's own field of view and lens, if any."""
+        lens_inputs = dict[str, Tensor]()
         if self.fov is not None:
-            camera_inputs["camera.fov"] = torch.tensor([self.fov])
+            lens_inputs["camera.fov"] = torch.tensor([self.fov])
         if self.camera_model is not None:
-            camera_inputs["camera.lens"] = torch.tensor(
+            lens_inputs["camera.lens"] = torch.tensor(
                 self.camera_model.intrinsics, dtype=torch.float32
             )
-        return camera_inputs
+        return lens_inputs
 
     def _compute_orbit_rotation(self, center: Tensor) -> Tensor:
         """Return the rotation (4, 4) about the vertical through a center by the azimuth."""

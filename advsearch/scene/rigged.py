@@ -14,7 +14,7 @@ joints that the user sets are applied in addition: about the axes of the object 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property, partial
 from typing import NamedTuple
 
@@ -227,9 +227,8 @@ class SkeletonRig:
         # Rotations that the user sets are about the mesh's axes. To convert them to the
         # file's, `to_mesh` is needed without its scale, the cube root of its
         # determinant.
-        self._rotation_to_mesh = torch.from_numpy(
-            to_mesh / np.cbrt(np.linalg.det(to_mesh))
-        )
+        unit_to_mesh = to_mesh / np.cbrt(np.linalg.det(to_mesh))
+        self._rotation_to_mesh = torch.from_numpy(unit_to_mesh)
         arrays = _JointArrays.join(parts, vertices)
         self._points = arrays.points
         self._joints = arrays.joints  # rows of `_nodes`
@@ -492,9 +491,9 @@ class SkeletonRig:
         }
         properties = {
             path: _replace_animated(
-                torch.from_numpy(values).to(device), clip, path, seconds
+                torch.from_numpy(rest).to(device), clip, path, seconds
             )
-            for path, values in rest_values.items()
+            for path, rest in rest_values.items()
         }
         composed = _compose_matrices(**properties)
         is_fixed = torch.from_numpy(skeleton.has_matrix).to(device)
@@ -514,13 +513,7 @@ class SkeletonRig:
             number_by_name: degrees by names such as "Head.z"; other names are ignored.
         """
         device = local_matrices.device
-        # the joints that have a rotation about any axis, each once and in order
-        joints = dict.fromkeys(
-            name.rpartition(".")[0]
-            for name in number_by_name
-            if name.rpartition(".")[2] in AXES
-        )
-        for joint in joints:
+        for joint in _list_turned_joints(number_by_name):
             node = self.node_of_joint[joint]
             rotation = _compose_axis_rotations(joint, number_by_name, device)
             rotation = self._convert_to_parent(rotation, node)
@@ -564,6 +557,16 @@ class SkeletonRig:
                 matrices = world_by_level[-1][parent_rows.to(device)] @ matrices
             world_by_level.append(matrices)
         return torch.cat(world_by_level)[self._node_order.to(device)]
+
+
+def _list_turned_joints(names: Iterable[str]) -> list[str]:
+    """Return the joints that have a rotation about any axis, each once and in order.
+
+    Args:
+        names: names of parameters; those of rotations are such as "Head.z".
+    """
+    split_names = [name.rpartition(".") for name in names]
+    return list(dict.fromkeys(joint for joint, _, axis in split_names if axis in AXES))
 
 
 def _replace_animated(

@@ -305,7 +305,7 @@ def _make_thing(
         )
     pose = _compute_pose(scene, asset, thing, metres)
     part = make_mesh_part(name, asset, pose, asset.material)
-    # the fields of the mesh, with the label of the thing if it has one
+    # all fields of the mesh's part, with the label of the thing if it has one
     fields = {**vars(part), "label": thing.label or asset.label}
     thing_part = ThingPart(**fields, size_in_metres=metres, lamps=thing.lamps)
     return thing_part, _list_thing_remarks(scene, thing, asset)
@@ -508,16 +508,26 @@ def list_camera_remarks(
     solid_names = [solid for solid in solids_of_eyes if solid is not None]
     if not solid_names:
         return ()
-    if len(eyes) == 1:
+    return (_describe_hidden_views(solid_names, len(eyes)),)
+
+
+def _describe_hidden_views(solid_names: Sequence[str], n_views: int) -> str:
+    """Describe in which of the views the camera is inside a solid of the place.
+
+    Args:
+        solid_names: the solid of each such view.
+        n_views: number of all views.
+    """
+    if n_views == 1:
         return (
             f"The camera is inside {solid_names[0]} of the place: it sees no object "
-            "from there; move it.",
+            "from there; move it."
         )
     solids = " or ".join(dict.fromkeys(solid_names))
-    fraction = 100.0 * len(solid_names) / len(eyes)
+    percentage = 100.0 * len(solid_names) / n_views
     return (
-        f"The camera is inside {solids} of the place in {fraction:.0f} % of the views: "
-        "it sees no object from there; narrow where it goes.",
+        f"The camera is inside {solids} of the place in {percentage:.0f} % of the "
+        "views: it sees no object from there; narrow where it goes."
     )
 
 

@@ -138,12 +138,12 @@ class _Measurements:
 
     Attributes:
         images: images (H, W, 3) at two seeds.
-        gradients: gradients (d,) at two seeds.
+        derivatives: gradients (d,) at two seeds.
         seconds: times of gradients.
     """
 
     images: list[Tensor] = field(default_factory=list)
-    gradients: list[Tensor] = field(default_factory=list)
+    derivatives: list[Tensor] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
 
     def add_renders(
@@ -158,7 +158,7 @@ class _Measurements:
         with torch.no_grad():
             self.images.append(variant(u, seed, spp))
         _, gradient = variant.gradient(loss, u, seed, spp)
-        self.gradients.append(gradient)
+        self.derivatives.append(gradient)
 
     def time_gradient(
         self,
@@ -190,7 +190,9 @@ def _compare_item(
         with_item: measurements with the renderer that computes the item.
     """
     image_difference = _relative_difference(search.images, with_item.images)
-    gradient_difference = _relative_difference(search.gradients, with_item.gradients)
+    gradient_difference = _relative_difference(
+        search.derivatives, with_item.derivatives
+    )
     variance_ratio = _compute_variance_ratio(search.images, with_item.images)
     seconds = statistics.median(with_item.seconds)
     search_seconds = statistics.median(search.seconds)

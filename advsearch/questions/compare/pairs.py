@@ -44,7 +44,7 @@ def compare_sides(
     shared_parameters = _find_shared_parameters(first, second)
     # Pairs of one unit, such as the frames of a drive, are not independent.
     unit_of_pair = first.rows["unit"].to_numpy()
-    # The difference and its interval are also in `count_pairs` below.
+    # `count_pairs` has the difference and its interval.
     _, _, p_value = statistics.clustered.compare_paired(
         first.is_right, second.is_right, unit_of_pair
     )

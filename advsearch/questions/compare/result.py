@@ -483,12 +483,9 @@ def _make_picture_parts(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
     lines_without_pictures = [
         _describe_example(example, pair) for example in examples if not example.pictures
     ]
-    groups = [
-        _group_pictures(example, pair) for example in examples if example.pictures
-    ]
-    has_single_images = groups and all(len(group) == 1 for group in groups)
-    if has_single_images:
-        groups = [[group[0] for group in groups]]
+    groups = _join_single_pictures(
+        [_group_pictures(example, pair) for example in examples if example.pictures]
+    )
     yield ResultPart(title, rows=text_rows[:MAX_PICTURES], only_medium="text")
     yield ResultPart(title, lines_without_pictures, pictures=groups, only_medium="page")
 
@@ -496,6 +493,14 @@ def _make_picture_parts(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
 def _describe_example(example: PairPicture, pair: ComparedPair) -> str:
     """Return what each side predicts for a pair, and the values of its parameters."""
     return "; ".join([*_make_captions(example, pair), _format_values(example)])
+
+
+def _join_single_pictures(
+    groups: list[list[views.Picture]],
+) -> list[list[views.Picture]]:
+    """Return groups of images as one group if each has a single image, else as they are."""
+    has_single_images = groups and all(len(group) == 1 for group in groups)
+    return [[group[0] for group in groups]] if has_single_images else groups
 
 
 def _group_pictures(example: PairPicture, pair: ComparedPair) -> list[views.Picture]:

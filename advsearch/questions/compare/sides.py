@@ -102,16 +102,25 @@ def read_sides(paths: Sequence[Path]) -> list[Side]:
         for folder in paths
         for side in read_sweep_sides(folder, is_only_sweep=len(paths) == 1)
     ]
-    if len(sides) < 2:
-        raise InputError(
-            "compared: expected a sweep of several models, or several sweeps, got "
-            f"{paths[0]}, a sweep of one model; "
-            "name another sweep of the same draws beside it, or give `model` two "
-            "models when you sweep"
-        )
+    _check_can_be_compared(sides, paths[0])
     for side in sides[1:]:
         check_same_draws(sides[0], side)
     return _select_in_view(sides, name_sides(sides), paths[0])
+
+
+def _check_can_be_compared(sides: Sequence[Side], path: Path) -> None:
+    """Check that there are at least two sides; `path` is the first sweep.
+
+    Raises:
+        InputError: there is only one.
+    """
+    if len(sides) < 2:
+        raise InputError(
+            "compared: expected a sweep of several models, or several sweeps, got "
+            f"{path}, a sweep of one model; "
+            "name another sweep of the same draws beside it, or give `model` two "
+            "models when you sweep"
+        )
 
 
 def _select_in_view(

@@ -578,10 +578,7 @@ class SweepRunner:
             self.interrupted = True
             return None
         self.n_renders += len(sampled)
-        images = torch.cat([batch_images for batch_images, _ in batches])
-        # All batches have the same function, since there is one model.
-        _, compute_features = batches[0]
-        return images, compute_features
+        return _join_batches(batches)
 
     def _warn_about_selection(self, selected: Sequence[int]) -> None:
         """Add a warning if not all sweeps have failures of the clustered model.
@@ -662,6 +659,18 @@ class SweepRunner:
             images.append(sweep.scenes.render_image(number))
             self.progress.advance(1)
         return torch.stack(images), compute_features
+
+
+def _join_batches(
+    batches: Sequence[tuple[torch.Tensor, Any]],
+) -> tuple[torch.Tensor, Any]:
+    """Return the images (n, H, W, 3) of all batches, and the function of the features.
+
+    All batches have the same function, since there is one model.
+    """
+    images = torch.cat([batch_images for batch_images, _ in batches])
+    _, compute_features = batches[0]
+    return images, compute_features
 
 
 def _name_fresh_draws(rows: pd.DataFrame, number: int) -> pd.DataFrame:

@@ -267,19 +267,23 @@ def make_sweep_along(
         scene_settings[factor] = _join_matching_names(config, factor, values)
     else:
         grid[factor] = values
-    # A parameter must not be set and be an axis at the same time.
-    set_values = {
-        name: value for name, value in config.set_.items() if name not in grid
-    }
     return make_minimal_config(
         config,
         grid=grid,
         controls=select_choices(config, grid),
         seed=seed,
-        set=set_values,
+        set=_leave_out_axes(config, grid),
         **SETTINGS_ALONG,
         **scene_settings,
     )
+
+
+def _leave_out_axes(config: SweepConfig, grid: Mapping[str, object]) -> dict[str, Any]:
+    """Return the parameters that a sweep sets, without the axes of a grid.
+
+    A parameter must not be set and be an axis at the same time.
+    """
+    return {name: value for name, value in config.set_.items() if name not in grid}
 
 
 def _make_point_grid(
@@ -356,12 +360,17 @@ def select_choices(
             for parameter in control_type.declare_parameters(options)
         ]
         if choices and all(name in grid for name in parameters):
-            # "kind" states the type of the control, if that is not its name.
-            used_names = {*choices, "kind"}
-            controls[instance] = {
-                name: value for name, value in options.items() if name in used_names
-            }
+            controls[instance] = _extract_choices(options, choices)
     return controls
+
+
+def _extract_choices(options: Mapping[str, Any], choices: set[str]) -> dict[str, Any]:
+    """Return the options of a control that are choices, and its "kind".
+
+    "kind" states the type of the control, if that is not its name.
+    """
+    used_names = {*choices, "kind"}
+    return {name: value for name, value in options.items() if name in used_names}
 
 
 def is_sampled(config: SweepConfig, factor: str) -> bool:

@@ -159,7 +159,7 @@ def _smooth_normals(
     point_of_vertex = data["index"].astype(np.int64)
     n_points = int(point_of_vertex.max()) + 1
     normal_sum = _sum_by_point(area_vectors, point_of_vertex[all_faces], n_points)
-    normals = normal_sum[point_of_vertex]
+    normals: Array = normal_sum[point_of_vertex]
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     return normals
 

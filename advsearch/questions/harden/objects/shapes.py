@@ -1103,7 +1103,8 @@ class _RoundedBox:
 
     def _to_chart(self, axis: int) -> Array:
         """Return the coordinates along an axis in [0, 1] instead of [-half, half]."""
-        return (self.coordinates[axis] + self.half[axis]) / (2 * self.half[axis])
+        half = self.half[axis]
+        return np.asarray((self.coordinates[axis] + half) / (2 * half))
 
     def _compute_face(self, axis: int, side: float) -> tuple[Array, Array]:
         """Return normals and points (V, U, 3) of a face, around the center of the box.
