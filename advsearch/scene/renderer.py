@@ -561,9 +561,8 @@ class Renderer:
         """
         # During the call below, `_select_difference_groups` leaves these out: "secant"
         # in any case, since its differences are written at the end.
-        self._skipped_estimators = (
-            DIFFERENCE_ESTIMATORS if free else frozenset({"secant"})
-        )
+        skipped = DIFFERENCE_ESTIMATORS if free else frozenset({"secant"})
+        self._skipped_estimators = skipped
         try:
             value, derivative = self._differentiate_loss(loss, u, seed, spp)
         finally:

@@ -669,6 +669,7 @@ def sample_track(track: Track, seconds: Tensor) -> Tensor:
     fraction = (seconds - times[start_key]) / span
     if track.interpolation == "CUBICSPLINE":
         spline = _interpolate_spline(keys[start_key], keys[end_key], fraction, span)
+        # 1e-12: never divide by 0
         return spline / spline.norm().clamp_min(1e-12) if is_rotation else spline
     # slerp interpolates on the sphere, lerp along a line
     interpolate = slerp if is_rotation else lerp

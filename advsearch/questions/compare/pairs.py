@@ -187,16 +187,28 @@ def split_by_value(
         for name in column.cat.categories:
             yield name, np.asarray(column == name)
     elif edges is not None:
-        bins = np.searchsorted(edges, column, side="right") - 1
-        # Values at the last edge, or beyond one by rounding, are in the part next to it.
-        bins = np.clip(bins, 0, len(edges) - 2)
-        for index, bounds in enumerate(pairwise(edges)):
-            yield bounds, bins == index
+        yield from _split_at_edges(column, edges)
     elif column.nunique() <= MAX_VALUES:
         for value in np.unique(column):
             # so that 0.1 is not printed as 0.10000000149, its nearest float32
             rounded_value = float(f"{value:.6g}")
             yield rounded_value, np.asarray(column == value)
+
+
+def _split_at_edges(
+    column: pd.Series, edges: Sequence[float]
+) -> Iterator[tuple[tuple[float, float], BoolArray]]:
+    """Yield the bounds of each part of a range, and the mask (n,) of the rows in it.
+
+    Args:
+        column: number in each row (n,).
+        edges: ascending bounds of the parts.
+    """
+    bins = np.searchsorted(edges, column, side="right") - 1
+    # Values at the last edge, or beyond one by rounding, are in the part next to it.
+    bins = np.clip(bins, 0, len(edges) - 2)
+    for index, bounds in enumerate(pairwise(edges)):
+        yield bounds, bins == index
 
 
 def find_pair_rules(

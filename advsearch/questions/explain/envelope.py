@@ -49,11 +49,7 @@ def find_envelope(
     """
     if selection_rows.empty:
         return None
-    # The box is chosen for its accuracy among the selection rows, which therefore is
-    # too large on average: a reserve is added to the required accuracy. Near 1 it is
-    # half of the distance to 1.
-    required = min(accuracy + ACCURACY_RESERVE, (1.0 + accuracy) / 2.0)
-    box = _peel_until(required, selection_rows)
+    box = _peel_until(_add_reserve(accuracy), selection_rows)
     if box is None:
         return None
     counts = count_right(test_rows[rules.find_covered(box, test_rows)])
@@ -65,6 +61,16 @@ def find_envelope(
         accuracy=accuracy,
         confirmed=lower_bound >= accuracy,
     )
+
+
+def _add_reserve(accuracy: float) -> float:
+    """Return the accuracy that a box has to have among the selection rows.
+
+    The box is chosen for its accuracy among these rows, which therefore is too large on
+    average: a reserve is added to the required accuracy. Near 1 it is half of the
+    distance to 1.
+    """
+    return min(accuracy + ACCURACY_RESERVE, (1.0 + accuracy) / 2.0)
 
 
 def _peel_until(

@@ -442,9 +442,8 @@ class ClusteredPredictions:
         The statistic of a grouping is the number of rows times its explained fraction.
         Without an interaction, the statistic of both factors together is the sum of the
         statistics of each. The excess over this sum is the test statistic. If rows are
-        independent, its distribution is chi-squared. Its degrees of freedom are (cells
-        - 1) - (first groups - 1) - (second groups - 1), where a cell is a group of
-        both factors. With clusters it is divided by its expectation, and its
+        independent, its distribution is chi-squared. The degrees of freedom follow from
+        the numbers of groups; a group of both factors is called a cell. With clusters it is divided by its expectation, and its
         distribution is F. The p-value is 1 if there are too few clusters.
 
         Args:
@@ -457,6 +456,7 @@ class ClusteredPredictions:
         second_fraction, n_second = self.explained_fraction(second_group)
         excess_fraction = joint_fraction - first_fraction - second_fraction
         statistic = len(self.correct) * excess_fraction
+        # (cells - 1) - (first groups - 1) - (second groups - 1)
         degrees = max(1, n_cells - n_first - n_second + 1)
         if self.is_independent:
             return float(chi2.sf(statistic, degrees))

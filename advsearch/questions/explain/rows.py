@@ -6,7 +6,7 @@ parameters; in a sweep of drives, all frames of a drive are rows of the same dra
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import pandas as pd
@@ -41,16 +41,21 @@ def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
     is_repeated = table.duplicated("image")
     table = table[~is_repeated].reset_index(drop=True)
     units = _collect_units(frames)
-    for name in units:
-        has_names = not pd.api.types.is_float_dtype(table[name])
-        if has_names:
-            table[name] = table[name].astype("category")
+    _make_names_categories(table, units)
     _, draw_indices = np.unique(table["draw"], return_inverse=True)
     table["unit"] = draw_indices
     table = table.drop(columns=["draw", "image"])
     table["correct"] = (table["correct"] == 1) & rules.is_in_view(table)
     table.attrs["units"] = units
     return table
+
+
+def _make_names_categories(table: pd.DataFrame, columns: Iterable[str]) -> None:
+    """Convert the columns that have names, and not numbers, to categories, in place."""
+    for name in columns:
+        has_names = not pd.api.types.is_float_dtype(table[name])
+        if has_names:
+            table[name] = table[name].astype("category")
 
 
 def _read_sweep_frame(index: int, sweep: workbench.StoredSweep) -> pd.DataFrame:

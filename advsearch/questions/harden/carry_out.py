@@ -400,10 +400,10 @@ class Hardening:
             self._record_weaker(name, measurement.weaker_measurement)
         to_attack = self._list_unmeasured(name)
         jobs = _make_attack_jobs(to_attack, steps_factor, weights)
-        hint = "`measured` and `steps` shorten it"
-        for index, status in self.scene_jobs.run_jobs(
-            measurement.title, jobs, hint=hint
-        ):
+        statuses = self.scene_jobs.run_jobs(
+            measurement.title, jobs, hint="`measured` and `steps` shorten it"
+        )
+        for index, status in statuses:
             control, number = to_attack[index]
             self._record(name, control, number, is_wrong=status != ROBUST)
 

@@ -224,11 +224,9 @@ class Augmentation:
         angle = degrees * (math.pi / 180.0)
         cosine = scale * angle.cos()
         sine = scale * angle.sin()
-        rows = (
-            torch.stack([cosine * mirror, -sine, shift_x], 1),
-            torch.stack([sine * mirror, cosine, shift_y], 1),
-        )
-        return torch.stack(rows, 1)
+        x_row = torch.stack([cosine * mirror, -sine, shift_x], dim=1)
+        y_row = torch.stack([sine * mirror, cosine, shift_y], dim=1)
+        return torch.stack([x_row, y_row], dim=1)
 
     def _change_colors(self, x: Tensor, generator: Generator) -> Tensor:
         """Change contrast, brightness and color of images (N, 3, H, W)."""

@@ -565,14 +565,15 @@ class GradientComputer:
         worst_loss = losses[len(part) :].sum()
         loss = plain_weight * plain_loss + worst_weight * worst_loss
         unrendered = _find_unrendered(part)
-        if unrendered:
-            unrendered_classes = [right_classes[index] for index in unrendered]
-            divergence = self._divergence_from_original(
-                images[unrendered], logits[unrendered], unrendered_classes
-            )
-            divergence_weight = plain_weight * ORIGINAL_MODEL_WEIGHT
-            loss = loss + divergence_weight * divergence
-        return loss
+        if not unrendered:
+            return loss
+        # The student should predict these images as the original model does.
+        divergence = self._divergence_from_original(
+            images[unrendered],
+            logits[unrendered],
+            right=[right_classes[index] for index in unrendered],
+        )
+        return loss + plain_weight * ORIGINAL_MODEL_WEIGHT * divergence
 
     def _divergence_from_original(
         self, images: Tensor, logits: Tensor, right: Sequence[tuple[int, ...]]

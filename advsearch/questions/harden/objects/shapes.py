@@ -1339,10 +1339,7 @@ def _split(patch: Patch, value: Array) -> tuple[Patch, assets.BoolArray]:
     # Interpolated normals are shorter than 1. They are normalized in place.
     cut_normals = normals[len(patch.normals) :]
     cut_normals /= np.linalg.norm(cut_normals, axis=1, keepdims=True)
-    cut_of_edge = {
-        (int(start), int(end)): len(patch.vertices) + index
-        for index, (start, end) in enumerate(crossed_edges)
-    }
+    cut_of_edge = _number_cuts(crossed_edges, first=len(patch.vertices))
     faces, is_inside = _split_faces(patch, value, cut_of_edge)
     split_patch = replace(
         patch,
@@ -1352,6 +1349,21 @@ def _split(patch: Patch, value: Array) -> tuple[Patch, assets.BoolArray]:
         faces=np.array(faces),
     )
     return split_patch, np.array(is_inside)
+
+
+def _number_cuts(
+    crossed_edges: assets.IntArray, first: int
+) -> dict[tuple[int, int], int]:
+    """Return the index of the new vertex of each edge, by the indices of its ends.
+
+    Args:
+        crossed_edges: (E, 2) ends of the edges that are cut.
+        first: index of the first new vertex.
+    """
+    return {
+        (int(start), int(end)): first + index
+        for index, (start, end) in enumerate(crossed_edges)
+    }
 
 
 def _split_faces(

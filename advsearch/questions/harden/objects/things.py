@@ -420,16 +420,29 @@ def _banana_skin(
     clouds = compute_value_noise(t.xyz / 2.2 + offset)
     color = blend_colors(skin, scale_brightness(skin, 0.86), clouds)
 
-    # Green fades over 2.6 cm from the stem, and over 2.2 cm from the tip.
+    color = _paint_ends_green(color, stem_distance, tip_distance, stem_length)
+    flecks = _flecks(t.xyz, offset, fleck_amount)
+    color = blend_colors(color, parse_hex_color(BANANA_BROWN), flecks * 0.85)
+    return _darken_ends(color, stem_distance, tip_distance, stem_length)
+
+
+def _paint_ends_green(
+    color: Array, stem_distance: Array, tip_distance: Array, stem_length: float
+) -> Array:
+    """Paint both ends of a banana green, which fades towards its middle.
+
+    Green fades over 2.6 cm from the stem, and over 2.2 cm from the tip.
+
+    Args:
+        color: colors (N, 3) of points.
+        stem_distance, tip_distance: distances (N,) from the ends of stem and tip.
+        stem_length: length of the stem.
+    """
     green = parse_hex_color("a9b13c")
     stem_green = np.clip(1.0 - (stem_distance - 0.9 * stem_length) / 2.6, 0.0, 1.0)
     tip_green = np.clip(1.0 - tip_distance / 2.2, 0.0, 1.0)
     color = blend_colors(color, green, stem_green * 0.75)
-    color = blend_colors(color, green, tip_green * 0.5)
-
-    flecks = _flecks(t.xyz, offset, fleck_amount)
-    color = blend_colors(color, parse_hex_color(BANANA_BROWN), flecks * 0.85)
-    return _darken_ends(color, stem_distance, tip_distance, stem_length)
+    return blend_colors(color, green, tip_green * 0.5)
 
 
 def _darken_ends(

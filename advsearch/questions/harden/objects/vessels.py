@@ -1110,11 +1110,24 @@ def _glass_paints(
         bottom = stem_height + 0.06 * depth
         outside, inside = _fill_with_wine(sampler, glass, drink, bottom, level)
     outside = choose_paint_or_random(sampler, height, outside, p_random=0.3)
-    if sampler.sample_bool(0.2, canonical=True):  # a golden rim
-        is_rim = make_range_mask(height - 0.35, 2 * height, soft=0.1)
-        outside = paint_over(outside, is_rim, paint_solid_color("c9a24b"))
+    outside = _sample_golden_rim(sampler, outside, height)
     foot = _sample_foot_paint(sampler, glass, outside, height)
     return {"foot": foot, "bowl": outside, "inside": inside}
+
+
+def _sample_golden_rim(sampler: ParameterSampler, paint: Paint, height: float) -> Paint:
+    """Return the paint of a glass; the canonical and one in five have a golden rim.
+
+    Args:
+        sampler: decides at random.
+        paint: paint of the outside.
+        height: height of the glass.
+    """
+    if not sampler.sample_bool(0.2, canonical=True):
+        return paint
+    # twice the height: the mask reaches the top and farther
+    is_rim = make_range_mask(height - 0.35, 2 * height, soft=0.1)
+    return paint_over(paint, is_rim, paint_solid_color("c9a24b"))
 
 
 def _fill_with_wine(
