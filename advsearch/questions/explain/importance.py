@@ -443,8 +443,9 @@ class ClusteredPredictions:
         Without an interaction, the statistic of both factors together is the sum of the
         statistics of each. The excess over this sum is the test statistic. If rows are
         independent, its distribution is chi-squared. The degrees of freedom follow from
-        the numbers of groups; a group of both factors is called a cell. With clusters it is divided by its expectation, and its
-        distribution is F. The p-value is 1 if there are too few clusters.
+        the numbers of groups; a group of both factors is called a cell. With clusters
+        the statistic is divided by its expectation, and its distribution is F. The
+        p-value is 1 if there are too few clusters.
 
         Args:
             joint_group: (n,) the group of each prediction by both factors.
