@@ -693,16 +693,30 @@ def _parse_images(path: str) -> dict[str, list[str]]:
     # the last of ten words is the file, whose name may have blanks
     words_of_images = [line.split(maxsplit=9) for line in image_lines]
     words_by_id = {words[0]: words for words in words_of_images}
-    if not words_by_id:
+    _check_different_images(path, len(words_by_id), len(image_lines))
+    return words_by_id
+
+
+def _check_different_images(path: str, n_different: int, n_images: int) -> None:
+    """Check that COLMAP's images.txt has images, each with an id of its own.
+
+    Args:
+        path: the file, for messages.
+        n_different: number of different ids.
+        n_images: number of images.
+
+    Raises:
+        FileFormatError: it has none, or an id twice.
+    """
+    if n_different == 0:
         raise FileFormatError(
             f"{path}: expected 2 to {MAX_CAMERAS} different cameras, got none"
         )
-    if len(words_by_id) < len(image_lines):
+    if n_different < n_images:
         raise FileFormatError(
             f"{path}: expected each image once, got one with the same number twice; "
             "correct the file"
         )
-    return words_by_id
 
 
 def _parse_image(where: str, words: Sequence[str]) -> Float64Array:
@@ -763,12 +777,17 @@ def _parse_names(path: str, listing_text: str, known_names: Sequence[str]) -> li
         )
     unknown = [name for name in names if name not in known_names]
     if unknown:
-        more = ", ..." if len(known_names) > 8 else ""
-        listing = ", ".join(known_names[:8]) + more
+        listing = _join_first_names(known_names)
         raise FileFormatError(
             f"{path}: expected some of its cameras {listing}, got {unknown[0][:40]!r}"
         )
     return names
+
+
+def _join_first_names(names: Sequence[str]) -> str:
+    """Return the first eight of some names with commas, and "..." if there are more."""
+    more = ", ..." if len(names) > 8 else ""
+    return ", ".join(names[:8]) + more
 
 
 def _make_mounts(

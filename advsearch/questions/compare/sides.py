@@ -271,12 +271,26 @@ def _read_finished_sweep(path: Path) -> tuple[workbench.StoredSweep, pd.DataFram
             f"predictions; go on with it: advsearch resume {path}"
         )
     rows = sweep.read_rows()
-    if len(rows) != summary.planned or not rows["step"].is_unique:
+    _check_complete(path, rows, summary.planned)
+    return sweep, rows
+
+
+def _check_complete(path: Path, rows: pd.DataFrame, n_planned: int) -> None:
+    """Check that a sweep has all of its rows, each once.
+
+    Args:
+        path: the run directory of the sweep, for the message.
+        rows: its rows.
+        n_planned: number of rows that its summary states.
+
+    Raises:
+        FileFormatError: it has more or fewer, or a row twice.
+    """
+    if len(rows) != n_planned or not rows["step"].is_unique:
         raise errors.FileFormatError(
-            f"{path}: expected {summary.planned} rows, as its summary says, got "
+            f"{path}: expected {n_planned} rows, as its summary says, got "
             f"{len(rows)}; sweep again"
         )
-    return sweep, rows
 
 
 def check_same_draws(first: Side, second: Side) -> None:
