@@ -382,10 +382,7 @@ class SurfaceParts:
         self.n_parts = MAP_SIZE * MAP_SIZE + len(faces)
         self.is_covered = charts.is_covered
         self.face_of_part = np.concatenate([charts.face_index.reshape(-1), faces])
-        cell_centers = charts.compute_positions().reshape(-1, 3)
-        face_centers = mesh.vertices[mesh.faces[faces]].mean(axis=1)
-        centers = np.concatenate([cell_centers, face_centers])
-        self.centers = centers.astype(np.float64)
+        self.centers = _compute_part_centers(charts, mesh, faces)
         face_center_uvs = self.face_uvs[faces].mean(axis=1)
         self.center_uvs = np.concatenate([_make_cell_uvs(), face_center_uvs])
 
@@ -423,6 +420,19 @@ class SurfaceParts:
         column_and_row = np.floor(np.stack([map_u, 1 - map_v]) * MAP_SIZE)
         column, row = np.clip(column_and_row, 0, MAP_SIZE - 1).astype(np.int64)
         return np.asarray(row * MAP_SIZE + column)
+
+
+def _compute_part_centers(charts: Charts, mesh: Mesh, faces: IntArray) -> Float64Array:
+    """Return the centers (count, 3) of the cells of a map, then of faces of a mesh.
+
+    Args:
+        charts: the rasterized map.
+        mesh: the mesh.
+        faces: (F,) indices of the faces that are parts.
+    """
+    cell_centers = charts.compute_positions().reshape(-1, 3)
+    face_centers = mesh.vertices[mesh.faces[faces]].mean(axis=1)
+    return np.concatenate([cell_centers, face_centers]).astype(np.float64)
 
 
 def _make_cell_uvs() -> Float64Array:

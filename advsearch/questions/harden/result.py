@@ -502,12 +502,12 @@ def _make_share_claim(when: str, share: Share, search: str) -> views.Claim:
         "interval": share.interval,
         "counts_right": True,
     }
+    accuracy = wording.percent(share.accuracy)
+    interval = wording.format_interval(share.interval)
     text = (
-        f"{when}, the searches ({search}) found no failure in "
-        f"{share.right} of {share.count} "
-        f"({wording.percent(share.accuracy)}, 95 % interval "
-        f"{wording.format_interval(share.interval)}) held-out "
-        "scenes. This does not show that there is none."
+        f"{when}, the searches ({search}) found no failure in {share.right} of "
+        f"{share.count} ({accuracy}, 95 % interval {interval}) held-out scenes. This "
+        "does not show that there is none."
     )
     return views.Claim.from_values(
         {"kind": "measured", "statement": text, "extent": extent}
