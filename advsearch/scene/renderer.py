@@ -1078,7 +1078,8 @@ class Renderer:
         by chance.
         """
         noise = torch.rand(self.start.shape, generator=generator)
-        return 0.5 * self.start + 0.25 + 0.1 * (noise - 0.5)
+        configuration: Tensor = 0.5 * self.start + 0.25 + 0.1 * (noise - 0.5)
+        return configuration
 
 
 def _find_inputs_of(group: Group, gradients: Mapping[str, Tensor]) -> frozenset[str]:
