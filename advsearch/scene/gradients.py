@@ -296,19 +296,6 @@ def make_first_plan(
         InputError: an estimator is unknown, or not valid where it was forced by name.
     """
     forced = dict(forced or {})
-    _check_forced_estimators(groups, forced)
-    planned = tuple(_plan_group(group, steps, forced, image_size) for group in groups)
-    return GradientPlan(planned, spp)
-
-
-def _check_forced_estimators(
-    groups: Sequence[Group], forced: Mapping[str, str]
-) -> None:
-    """Check that all estimators that the user forces exist, and all groups or controls.
-
-    Raises:
-        UnknownNameError: one does not.
-    """
     known_names = {name for group in groups for name in (group.name, group.control)}
     for name, estimator in forced.items():
         if estimator not in ESTIMATORS:
@@ -317,6 +304,9 @@ def _check_forced_estimators(
     for name in forced:
         if name not in (ALL_GROUPS, *known_names):
             raise UnknownNameError("control in `estimators`", name, sorted(known_names))
+    return GradientPlan(
+        tuple(_plan_group(group, steps, forced, image_size) for group in groups), spp
+    )
 
 
 def _plan_group(
@@ -350,28 +340,18 @@ def _plan_group(
             group, estimator=forced_by_name, reason="forced by name", is_forced=True
         )
     forced_for_all = forced.get(ALL_GROUPS)
-    if forced_for_all is not None and _can_be_forced_for_all(group, forced_for_all):
+    # Some estimators are valid for every group, and are not listed in `valid`. They are
+    # not forced on a group that only changes the finished image ("image"), whose
+    # derivative needs no render.
+    is_always_valid = (
+        forced_for_all in ALWAYS_VALID_ESTIMATORS and "image" not in group.valid
+    )
+    if forced_for_all is not None and (
+        forced_for_all in group.valid or is_always_valid
+    ):
         return replace(
             group, estimator=forced_for_all, reason="forced for all", is_forced=True
         )
-    return _prefer_first_estimator(group)
-
-
-def _can_be_forced_for_all(group: Group, estimator: str) -> bool:
-    """Return whether an estimator that is forced for all groups is used for one of them.
-
-    Some estimators are valid for every group, and are not listed in `valid`. They are
-    not forced on a group that only changes the finished image ("image"), whose
-    derivative needs no render.
-    """
-    is_always_valid = (
-        estimator in ALWAYS_VALID_ESTIMATORS and "image" not in group.valid
-    )
-    return estimator in group.valid or is_always_valid
-
-
-def _prefer_first_estimator(group: Group) -> Group:
-    """Return a group with the first of its valid estimators, of which it has some."""
     reason = "the only valid estimator"
     if len(group.valid) > 1:
         reason = f"preferred among {', '.join(group.valid)}; not measured"
@@ -429,33 +409,18 @@ def forbid_second_derivatives(backward: Backward) -> Backward:
         # gradients are enabled here only with `create_graph`, for a second derivative
         if not torch.is_grad_enabled():
             return derivatives
-        return _guard_derivatives(derivatives, cotangent, ctx.saved_tensors)
+        # A guarded value depends, for autograd, on all that the derivative depends on:
+        # differentiating it again reaches the guard, which raises the error.
+        arguments = (cotangent, *ctx.saved_tensors)
+        guarded = []
+        for value in derivatives:
+            # An identity returns the cotangent itself, whose derivative is right.
+            if value is not None and value is not cotangent:
+                value = _OnceDifferentiable.apply(value, *arguments)  # type: ignore[no-untyped-call]
+            guarded.append(value)
+        return tuple(guarded)
 
     return once
-
-
-def _guard_derivatives(
-    derivatives: Sequence[Tensor | None],
-    cotangent: Tensor,
-    saved_tensors: Sequence[Tensor],
-) -> tuple[Tensor | None, ...]:
-    """Return derivatives that raise an error if they are differentiated again.
-
-    For autograd, a guarded value depends on all that the derivative depends on:
-    differentiating it again reaches the guard, which raises the error.
-
-    Args:
-        derivatives: results of a backward pass.
-        cotangent: its argument.
-        saved_tensors: tensors that the forward pass has stored for it.
-    """
-    guarded = []
-    for value in derivatives:
-        # An identity returns the cotangent itself, whose derivative is right.
-        if value is not None and value is not cotangent:
-            value = _OnceDifferentiable.apply(value, cotangent, *saved_tensors)  # type: ignore[no-untyped-call]
-        guarded.append(value)
-    return tuple(guarded)
 
 
 class _OnceDifferentiable(torch.autograd.Function):
