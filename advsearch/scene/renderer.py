@@ -815,10 +815,10 @@ class Renderer:
             )
             exposed = exposed + render.row_weights * radiance
             if self.formation.denoiser == "oidn":
-                guides = guides + render.row_weights * self._render_guides(render)
+                with torch.no_grad():
+                    guides = guides + render.row_weights * self._render_guides(render)
         return exposed, guides
 
-    @torch.no_grad()
     def _render_guides(self, render: _MomentRender) -> Tensor:
         """Render the guides of the denoiser (H, W, 6), albedo and normals, of a moment."""
         guide_seed = seeds.derive_seed(self.root_seed, "guides", render.seed)
@@ -1061,15 +1061,17 @@ class Renderer:
             return {}
         generator = torch.Generator().manual_seed(0)
         u = self._sample_generic_configuration(generator).requires_grad_()
-        gradients = dict[str, Tensor]()  # by the name of the scene input
+        reaching_groups = dict[str, list[str]]()  # names, by that of the scene input
         with torch.enable_grad():
             inputs = self.scene.input_assembler(self.space.inputs(u))
             for name, tensor in inputs.items():
                 if tensor.requires_grad:
                     gradient = _differentiate_input_sum(tensor, u, generator)
                     if gradient is not None:
-                        gradients[name] = gradient
-        return {group.name: _find_inputs_of(group, gradients) for group in groups}
+                        reaching_groups[name] = _list_reaching_groups(groups, gradient)
+        return {
+            group.name: _find_inputs_of(group.name, reaching_groups) for group in groups
+        }
 
     def _sample_generic_configuration(self, generator: torch.Generator) -> Tensor:
         """Sample a configuration (d,) half way from the start to the center of the box.
@@ -1082,17 +1084,29 @@ class Renderer:
         return configuration
 
 
-def _find_inputs_of(group: Group, gradients: Mapping[str, Tensor]) -> frozenset[str]:
+def _list_reaching_groups(groups: Sequence[Group], gradient: Tensor) -> list[str]:
+    """Return the names of the groups that reach a scene input.
+
+    Args:
+        groups: groups of coordinates.
+        gradient: derivative (d,) of the input by all coordinates.
+    """
+    return [group.name for group in groups if gradient[group.coordinates].any()]
+
+
+def _find_inputs_of(
+    group_name: str, reaching_groups: Mapping[str, Sequence[str]]
+) -> frozenset[str]:
     """Return the scene inputs that a group of coordinates reaches.
 
     Args:
-        group: the group.
-        gradients: derivatives (d,) by all coordinates, by the name of the input.
+        group_name: name of the group.
+        reaching_groups: names of the groups that reach an input, by the input's name.
     """
     return frozenset(
         name
-        for name, gradient in gradients.items()
-        if gradient[group.coordinates].any()
+        for name, group_names in reaching_groups.items()
+        if group_name in group_names
     )
 
 

@@ -875,7 +875,6 @@ FINISHES = {
 }
 
 
-# built in metres; the texture is 384 texels wide
 TEXEL_DENSITY = {"rubber": 0.3, "well": 0.15, "rim": 0.35, "trim": 0.7, "plate": 3.0}
 """Texels per length, relative to the paint: fewer for parts that are hardly visible, more
 for the signs on the plate.
