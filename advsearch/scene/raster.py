@@ -159,12 +159,7 @@ def _find_column_span(
         (N,) smallest and (N,) largest column; (inf, -inf) where nothing is left.
     """
     x = corners[..., 0]
-    y = corners[..., 1]
-    strip_start = row[:, None]
-    strip_end = strip_start + 1
-    is_in_strip = (y >= strip_start - PIXEL_TOLERANCE) & (
-        y <= strip_end + PIXEL_TOLERANCE
-    )
+    is_in_strip = _are_in_strips(corners[..., 1], row)
     left = np.where(is_in_strip, x, np.inf).min(axis=1)
     right = np.where(is_in_strip, x, -np.inf).max(axis=1)
     for border_row in (row, row + 1):
@@ -174,6 +169,19 @@ def _find_column_span(
         left = np.where(crosses, np.minimum(left, first_column), left)
         right = np.where(crosses, np.maximum(right, last_column), right)
     return left, right
+
+
+def _are_in_strips(y: Float64Array, row: IntArray) -> BoolArray:
+    """Return whether corners (N, 3) are between the row (N,) of a strip and the next.
+
+    Args:
+        y: rows of the corners.
+        row: first row of each strip.
+    """
+    strip_start = row[:, None]
+    strip_end = strip_start + 1
+    is_after_start = y >= strip_start - PIXEL_TOLERANCE
+    return np.asarray(is_after_start & (y <= strip_end + PIXEL_TOLERANCE))
 
 
 def compute_barycentric(
@@ -381,11 +389,7 @@ def rasterize_charts(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
     shape = (resolution, resolution) if isinstance(resolution, int) else resolution
     corners = _to_texel_coordinates(mesh, shape)
     face, row, column = find_candidate_pixels(corners, shape)
-    if len(face) == 0:
-        raise InputError(
-            f"mesh texture coordinates: none of the {shape[0]} x {shape[1]} texels "
-            "lies in a triangle; unwrap the mesh again"
-        )
+    _check_any_texel_covered(face, shape)
     points = np.stack([column, row], axis=1)
     weights = _compute_clipped_weights(corners[face], points)
     face_map = np.zeros(shape, np.int64)
@@ -394,6 +398,37 @@ def rasterize_charts(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
     face_map[row, column] = face
     weight_map[row, column] = weights
     is_covered[row, column] = True
+    return _fill_charts(mesh, face_map, weight_map, is_covered)
+
+
+def _check_any_texel_covered(face: IntArray, shape: tuple[int, int]) -> None:
+    """Check that the triangles of a texture of some shape cover a texel.
+
+    Args:
+        face: (N,) the triangle of each texel that is covered.
+        shape: height and width of the texture.
+
+    Raises:
+        InputError: no texel is covered.
+    """
+    if len(face) == 0:
+        raise InputError(
+            f"mesh texture coordinates: none of the {shape[0]} x {shape[1]} texels "
+            "lies in a triangle; unwrap the mesh again"
+        )
+
+
+def _fill_charts(
+    mesh: Mesh, face_map: IntArray, weight_map: Float64Array, is_covered: BoolArray
+) -> Charts:
+    """Return charts whose texels outside have the values of the nearest covered texel.
+
+    Args:
+        mesh: mesh with texture coordinates.
+        face_map: (h, w) face of each covered texel.
+        weight_map: (h, w, 3) barycentric weights of each covered texel.
+        is_covered: (h, w) whether a texel is covered.
+    """
     # A covered texel is its own nearest one, at the distance 0.
     distance, nearest_indices = ndimage.distance_transform_edt(
         ~is_covered, return_indices=True
@@ -451,22 +486,43 @@ def look_up_texture(
     top = np.floor(y)
     column_fraction = (x - left).astype(np.float32)[..., None]
     row_fraction = (y - top).astype(np.float32)[..., None]
-    # beyond an edge the texture begins again
-    column0 = (left % width).astype(np.int64)
-    column1 = ((left + 1) % width).astype(np.int64)
-    row0 = (top % height).astype(np.int64)
-    row1 = ((top + 1) % height).astype(np.int64)
-    upper = (
-        texels[row0, column0] * (1 - column_fraction)
-        + texels[row0, column1] * column_fraction
-    )
-    lower = (
-        texels[row1, column0] * (1 - column_fraction)
-        + texels[row1, column1] * column_fraction
-    )
-    return np.asarray(
-        upper * (1 - row_fraction) + lower * row_fraction, dtype=np.float32
-    )
+    columns = _wrap_neighbors(left, width)
+    upper_row, lower_row = _wrap_neighbors(top, height)
+    upper = _interpolate_columns(texels, upper_row, columns, column_fraction)
+    lower = _interpolate_columns(texels, lower_row, columns, column_fraction)
+    mean = upper * (1 - row_fraction) + lower * row_fraction
+    return np.asarray(mean, dtype=np.float32)
+
+
+def _wrap_neighbors(
+    first: npt.NDArray[np.floating], size: int
+) -> tuple[IntArray, IntArray]:
+    """Return rows or columns (...) and the next ones, wrapped at a texture's border.
+
+    Args:
+        first: (...) whole numbers, which may be outside of the texture.
+        size: number of rows or columns of the texture.
+    """
+    return (first % size).astype(np.int64), ((first + 1) % size).astype(np.int64)
+
+
+def _interpolate_columns(
+    texels: Float32Array,
+    row: IntArray,
+    columns: tuple[IntArray, IntArray],
+    fraction: Float32Array,
+) -> npt.NDArray[np.floating]:
+    """Interpolate linearly between two texels of a row, (..., C).
+
+    Args:
+        texels: (H, W, C) the texture.
+        row: (...) row of both texels.
+        columns: (...) column of the left texel, and (...) of the right one.
+        fraction: (..., 1) 0 at the left texel and 1 at the right one.
+    """
+    left_column, right_column = columns
+    left_part = texels[row, left_column] * (1 - fraction)
+    return np.asarray(left_part + texels[row, right_column] * fraction)
 
 
 class MeshSurface:
@@ -477,31 +533,12 @@ class MeshSurface:
     """
 
     def __init__(self, mesh: Mesh) -> None:
-        """Compute boxes and normals of the faces, and which faces are neighbors.
-
-        Faces are neighbors if they share an edge. Edges are compared by the positions
-        of their ends: at a UV seam the faces on both sides have different vertices at
-        the same positions.
-        """
+        """Compute boxes and normals of the faces, and which faces are neighbors."""
         self._corners = mesh.vertices[mesh.faces].astype(np.float64)
         self.normals = _compute_face_normals(mesh)
         self._lower = self._corners.min(axis=1)
         self._upper = self._corners.max(axis=1)
-        # (F, 3) corners of the faces, with one index for all vertices at one position
-        point_of_vertex = weld_vertices(mesh)[0]
-        corners = point_of_vertex[mesh.faces]
-        # (3 F, 2) edges in three blocks, each with one edge of all faces
-        edges = np.concatenate(
-            [corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]
-        )
-        # Sorted by their ends, equal edges follow one another: their faces are
-        # neighbors.
-        edges = np.sort(edges, axis=1)
-        order = np.lexsort((edges[:, 1], edges[:, 0]))
-        is_same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
-        face = order % len(mesh.faces)  # each block of edges has one edge of every face
-        # (E, 2) pairs of faces
-        self._neighbours = np.stack([face[:-1][is_same], face[1:][is_same]], axis=1)
+        self._neighbours = _find_neighboring_faces(mesh)  # (E, 2) pairs of faces
 
     def find_hit(
         self, origin: Float64Array, direction: Float64Array
@@ -545,11 +582,7 @@ class MeshSurface:
         p = np.cross(direction, c - a)
         determinant = ((b - a) * p).sum(axis=1)
         # 0 means that the ray is in the plane of the face
-        inverse = np.where(
-            np.abs(determinant) > 1e-15,
-            1.0 / np.where(determinant == 0.0, 1.0, determinant),
-            0.0,
-        )
+        inverse = _invert_unless_tiny(determinant)
         t = origin - a
         u = (t * p).sum(axis=1) * inverse
         q = np.cross(t, b - a)
@@ -591,6 +624,31 @@ class MeshSurface:
         left_face, right_face = self._neighbours[is_pair_inside].T
         component = find_components(len(is_inside), left_face, right_face)
         return np.asarray(is_inside & (component == component[face]))
+
+
+def _invert_unless_tiny(values: Float64Array) -> Float64Array:
+    """Return 1 / value for each value (N,), and 0 for values that are about 0."""
+    divisor = np.where(values == 0.0, 1.0, values)
+    return np.where(np.abs(values) > 1e-15, 1.0 / divisor, 0.0)
+
+
+def _find_neighboring_faces(mesh: Mesh) -> IntArray:
+    """Return the pairs (E, 2) of faces that share an edge.
+
+    Edges are compared by the positions of their ends: at a UV seam the faces on both
+    sides have different vertices at the same positions.
+    """
+    # (F, 3) corners of the faces, with one index for all vertices at one position
+    point_of_vertex = weld_vertices(mesh)[0]
+    corners = point_of_vertex[mesh.faces]
+    # (3 F, 2) edges in three blocks, each with one edge of all faces
+    edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+    # Sorted by their ends, equal edges follow one another: their faces are neighbors.
+    edges = np.sort(edges, axis=1)
+    order = np.lexsort((edges[:, 1], edges[:, 0]))
+    is_same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
+    face = order % len(mesh.faces)  # each block of edges has one edge of every face
+    return np.stack([face[:-1][is_same], face[1:][is_same]], axis=1)
 
 
 def weld_vertices(mesh: Mesh) -> tuple[IntArray, int]:

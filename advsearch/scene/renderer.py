@@ -16,9 +16,10 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -104,6 +105,18 @@ class Crop(NamedTuple):
     window: Window  # window of the pixels that are rendered
     # radiance (H, W, 3) of the full image; with a backdrop (H, W, 4), with coverage
     surrounding_image: Tensor
+
+
+class _MomentRender(NamedTuple):
+    """What is rendered of one moment of an exposure."""
+
+    inputs: dict[str, Tensor]  # inputs of Mitsuba's scene
+    seed: int  # of the noise
+    spp: int  # samples per pixel
+    # (H, 1, 1) the moment's fraction of the exposure of each row. Rows of a sensor may
+    # be read one after the other: then each is exposed during some moments only. Over
+    # all moments the fractions of a row add up to 1.
+    row_weights: Tensor
 
 
 # Largest size of a group whose motion of outlines is measured.
@@ -332,14 +345,13 @@ class Renderer:
             # Autograd does not differentiate all coordinates through `autograd_u` if
             # that is another tensor than u. The others are differentiated by
             # differences.
-            needs_differences = (
-                autograd_u is not u
-                and torch.is_grad_enabled()
-                and len(self._select_difference_groups()) > 0
-            )
-            if needs_differences:
+            if autograd_u is not u and self._needs_differences():
                 image = _Differences.apply(self, seed, spp, u, image)  # type: ignore[no-untyped-call]
             return image
+
+    def _needs_differences(self) -> bool:
+        """Return whether a derivative is wanted that takes differences."""
+        return torch.is_grad_enabled() and len(self._select_difference_groups()) > 0
 
     def radiance(self, u: Configuration, seed: int = 0, spp: int = 16) -> Tensor:
         """Render linear radiance (H, W, 3) float32; arguments as for a call.
@@ -374,28 +386,34 @@ class Renderer:
         with torch.no_grad():
             inputs = self.scene.input_assembler(self.space.inputs(u))
             halves, mean = self.trace_independent_radiances(inputs, seed, spp)
-
-            def finish(radiance: Tensor) -> Tensor:
-                """Return the radiance with exposure and backdrop, before the curve."""
-                return self.finish_image(radiance, inputs, u, display=False)
-
+            # with exposure and backdrop, before the curve
+            finish = partial(self.finish_image, inputs=inputs, u=u, display=False)
             clean = finish(mean)
             clean_image = self.formation.map_to_display(clean)
-
-            def display_on_tangent(radiance: Tensor) -> Tensor:
-                """Return the image of radiance on the curve's tangent at `clean`.
-
-                The change along the tangent is extrapolated from a small fraction of
-                the change of radiance, within which the curve is nearly straight.
-                """
-                nearby = torch.lerp(clean, finish(radiance), STRAIGHT_FRACTION)
-                small_change = self.formation.map_to_display(nearby) - clean_image
-                change = small_change / STRAIGHT_FRACTION
-                return self.space.apply_to_image(u, clean_image + change)
-
-            first = display_on_tangent(halves[0])
-            second = display_on_tangent(halves[1])
+            first, second = (
+                self._display_on_tangent(finish(half), clean, clean_image, u)
+                for half in halves
+            )
             return first, second, self.space.apply_to_image(u, clean_image)
+
+    def _display_on_tangent(
+        self, radiance: Tensor, clean: Tensor, clean_image: Tensor, u: Tensor
+    ) -> Tensor:
+        """Return the image of radiance on the tone curve's tangent at `clean`.
+
+        The change along the tangent is extrapolated from a small fraction of the change of
+        radiance, within which the curve is nearly straight.
+
+        Args:
+            radiance: (H, W, 3) radiance before the curve.
+            clean: (H, W, 3) the same without noise.
+            clean_image: (H, W, 3) sRGB, the image of `clean`.
+            u: configuration, for the controls that change the finished image.
+        """
+        nearby = torch.lerp(clean, radiance, STRAIGHT_FRACTION)
+        small_change = self.formation.map_to_display(nearby) - clean_image
+        change = small_change / STRAIGHT_FRACTION
+        return self.space.apply_to_image(u, clean_image + change)
 
     def trace_independent_radiances(
         self, inputs: Mapping[str, Tensor], seed: int, spp: int
@@ -425,16 +443,46 @@ class Renderer:
         ]
         mean = (halves[0] + halves[1]) / 2.0
         # One render of the guides serves both halves; its seed follows from the first.
-        guide_seed = seeds.derive_seed(self.root_seed, "guides", noise_seeds[0])
+        denoise = self._make_denoiser(
+            scene_inputs, noise_seeds[0], spp, hides_environment
+        )
+        return halves, self._denoise_in_window(mean, denoise)
+
+    def _make_denoiser(
+        self,
+        scene_inputs: Mapping[str, Tensor],
+        noise_seed: int,
+        spp: int,
+        hides_environment: bool,
+    ) -> Callable[[Tensor], Tensor]:
+        """Render a denoiser's guides, and return the function that denoises with them.
+
+        Args:
+            scene_inputs: inputs of Mitsuba's scene.
+            noise_seed: seed of the images to be denoised, from which that of the guides
+                is derived.
+            spp: samples per pixel of the guides.
+            hides_environment: whether the environment is hidden behind a backdrop.
+        """
+        guide_seed = seeds.derive_seed(self.root_seed, "guides", noise_seed)
         with self.scene.limit_window(self.window):
             albedo, normal = self.scene.render_guides(scene_inputs, guide_seed, spp)
         plane_radiance = self.scene.plane_radiance if hides_environment else None
+        return partial(
+            denoise_image, albedo=albedo, normal=normal, plane_radiance=plane_radiance
+        )
+
+    def _denoise_in_window(
+        self, image: Tensor, denoise: Callable[[Tensor], Tensor]
+    ) -> Tensor:
+        """Denoise an image (H, W, C); with a crop only its window, which alone is noisy.
+
+        The surroundings of the window were denoised when they were rendered.
+        """
         if self.crop is None:
-            return halves, denoise_image(mean, albedo, normal, plane_radiance)
-        # Only the window is noisy: the surroundings were denoised when they were made.
-        window_mean = self.crop.window.crop_image(mean)
-        clean = denoise_image(window_mean, albedo, normal, plane_radiance)
-        return halves, self.crop.window.paste(clean, self.crop.surrounding_image)
+            return denoise(image)
+        clean = denoise(self.crop.window.crop_image(image))
+        return self.crop.window.paste(clean, self.crop.surrounding_image)
 
     def compute_scene_inputs(self, u: Tensor) -> dict[str, Tensor]:
         """Return the inputs of Mitsuba's scene at a configuration, without a graph."""
@@ -473,14 +521,11 @@ class Renderer:
                 _select_scene_inputs(inputs), subdivision
             )
             if "backdrop.front" in inputs:
-                # The first channel is the hidden fraction of the object. Where
-                # something in front hides most of a pixel, no surface of the scene is
-                # visible.
-                is_hidden = inputs["backdrop.front"][..., 0] > 0.5
-                for dim in (0, 1):  # a pixel's value for all of its points
-                    is_hidden = is_hidden.repeat_interleave(subdivision, dim)
-                surfaces.id[is_hidden] = 0  # no surface; depths stay
-        # The scene is in object sizes.
+                _remove_hidden_surfaces(surfaces, inputs["backdrop.front"], subdivision)
+        return self._convert_depths_to_metres(surfaces)
+
+    def _convert_depths_to_metres(self, surfaces: Surfaces) -> Surfaces:
+        """Return surfaces with depths in metres; those of the scene are in object sizes."""
         object_size = self.scene.description_and_filter[0].size_in_metres
         return replace(
             surfaces,
@@ -516,22 +561,35 @@ class Renderer:
         """
         # During the call below, `_select_difference_groups` leaves these out: "secant"
         # in any case, since its differences are written at the end.
-        self._skipped_estimators = (
-            DIFFERENCE_ESTIMATORS if free else frozenset({"secant"})
-        )
+        skipped = DIFFERENCE_ESTIMATORS if free else frozenset({"secant"})
+        self._skipped_estimators = skipped
         try:
-            with torch.inference_mode(False), torch.enable_grad():
-                leaf = u.detach().clone().requires_grad_()
-                value = loss(self(leaf, seed, spp))
-            gradient = None
-            if value.requires_grad:
-                (gradient,) = torch.autograd.grad(value, leaf, allow_unused=True)
+            value, derivative = self._differentiate_loss(loss, u, seed, spp)
         finally:
             self._skipped_estimators = frozenset()
-        # A loss that does not depend on u has no graph, and no gradient.
-        derivative = torch.zeros_like(leaf) if gradient is None else gradient
         if not free:
             self._write_secant_differences(loss, u.detach(), seed, spp, derivative)
+        return value, derivative
+
+    def _differentiate_loss(
+        self, loss: Callable[[Tensor], Tensor], u: Tensor, seed: int, spp: int
+    ) -> tuple[Tensor, Tensor]:
+        """Return a loss of the image of u without graph, and its derivative by autograd.
+
+        Args:
+            loss: function from an image (H, W, 3) sRGB to a scalar.
+            u: (d,) configuration.
+            seed: seed of the noise.
+            spp: samples per pixel.
+        """
+        with torch.inference_mode(False), torch.enable_grad():
+            leaf = u.detach().clone().requires_grad_()
+            value = loss(self(leaf, seed, spp))
+        gradient = None
+        if value.requires_grad:
+            (gradient,) = torch.autograd.grad(value, leaf, allow_unused=True)
+        # A loss that does not depend on u has no graph, and no gradient.
+        derivative = torch.zeros_like(leaf) if gradient is None else gradient
         return value.detach(), derivative
 
     @torch.no_grad()
@@ -579,40 +637,40 @@ class Renderer:
             needs no derivatives, both are the same object.
         """
         u = _to_tensor(u)
+        self._check_shape(u)
+        if not 1 <= spp <= MAX_SPP:
+            raise InputError(f"spp: expected 1 to {MAX_SPP} samples a pixel, got {spp}")
+        _check_in_unit_box(u)
+        _check_can_have_gradient(u)
+        with _leave_inference_mode():
+            u = u.clone() if u.is_inference() else u
+            return u, self._limit_autograd(u)
+
+    def _check_shape(self, u: Tensor) -> None:
+        """Check that a configuration has the shape (d,) of the start.
+
+        Raises:
+            InputError: it has another one.
+        """
         if u.shape != self._shape:
             raise InputError(
                 f"render: expected u of shape {tuple(self._shape)}, got "
                 f"{tuple(u.shape)}"
             )
-        if not 1 <= spp <= MAX_SPP:
-            raise InputError(f"spp: expected 1 to {MAX_SPP} samples a pixel, got {spp}")
-        # An empty configuration has no smallest number. NaN fails both comparisons.
-        is_in_range = True
-        if u.numel():
-            smallest, largest = torch.aminmax(u.detach())
-            is_in_range = bool((smallest >= 0.0) & (largest <= 1.0))
-        if not is_in_range:
-            raise InputError(
-                "render: expected every entry of u in [0, 1]; project u "
-                "before you render it"
-            )
-        if u.is_inference() and u.requires_grad:
-            raise InputError(
-                "render: u was made in `torch.inference_mode()`, so that nothing can "
-                "be differentiated with respect to "
-                "it; make it outside, or pass `u.detach()` for the picture alone"
-            )
-        with _leave_inference_mode():
-            u = u.clone() if u.is_inference() else u
-            # A prediction is differentiated by autograd for all coordinates.
-            if self._predict is not None or not u.requires_grad:
-                return u, u
-            is_by_autograd = self.plan.autograd_mask
-            if bool(is_by_autograd.all()):
-                return u, u
-            # The difference is 0, so that the value is u; the derivative is the mask.
-            autograd_u = u.detach() + is_by_autograd * (u - u.detach())
-            return u, autograd_u
+
+    def _limit_autograd(self, u: Tensor) -> Tensor:
+        """Return a configuration that autograd differentiates only as the plan states.
+
+        It is u itself if autograd differentiates all coordinates, or none is needed.
+        """
+        # A prediction is differentiated by autograd for all coordinates.
+        if self._predict is not None or not u.requires_grad:
+            return u
+        is_by_autograd = self.plan.autograd_mask
+        if bool(is_by_autograd.all()):
+            return u
+        # The difference is 0, so that the value is u; the derivative is the mask.
+        return u.detach() + is_by_autograd * (u - u.detach())
 
     def _render_image(
         self, u: Tensor, seed: int, spp: int, *, display: bool = True
@@ -629,31 +687,40 @@ class Renderer:
             (H, W, 3); for a rig of K cameras their images side by side, (H, K W, 3).
         """
         renders_before = self.n_renders
-        images = list[Tensor]()
         # without a rig there is one camera, with no mount
-        for index, mount in enumerate(
-            self.scene.description_and_filter[0].rig or (None,)
-        ):
-            # the first camera has the noise of a scene without a rig
-            camera_seed = seed
-            if index > 0:
-                camera_seed = seeds.derive_seed(seed, "camera", index)
-            inputs = self._make_camera_inputs(mount, u)
-            hides_environment = "backdrop.color" in inputs
-            if self.moments:  # an exposure of some time
-                rendered = self._render_exposure(
-                    mount, u, camera_seed, spp, hides_environment
-                )
-            else:
-                rendered = self.render_radiance(
-                    _select_scene_inputs(inputs), camera_seed, spp, hides_environment
-                )
-            images.append(self.finish_image(rendered, inputs, u, display=display))
+        rig = self.scene.description_and_filter[0].rig
+        mounts: Sequence[RigCamera | None] = rig or (None,)
+        images = list[Tensor]()
+        for index, mount in enumerate(mounts):
+            camera_seed = _derive_camera_seed(seed, index)
+            images.append(self._render_camera(mount, u, camera_seed, spp, display))
         if len(images) == 1:
             return images[0]
         # Budgets count configurations: all cameras of a rig are one render.
         self.n_renders = renders_before + 1
         return torch.cat(images, dim=1)
+
+    def _render_camera(
+        self, mount: RigCamera | None, u: Tensor, seed: int, spp: int, display: bool
+    ) -> Tensor:
+        """Render the image (H, W, 3) of one camera, or its radiance before display.
+
+        Args:
+            mount: a camera of a rig; None if the scene has one camera.
+            u: (d,) configuration.
+            seed: seed of the noise.
+            spp: samples per pixel.
+            display: if False, return the radiance that is to be displayed.
+        """
+        inputs = self._make_camera_inputs(mount, u)
+        hides_environment = "backdrop.color" in inputs
+        if self.moments:  # an exposure of some time
+            rendered = self._render_exposure(mount, u, seed, spp, hides_environment)
+        else:
+            rendered = self.render_radiance(
+                _select_scene_inputs(inputs), seed, spp, hides_environment
+            )
+        return self.finish_image(rendered, inputs, u, display=display)
 
     def _make_camera_inputs(
         self, mount: RigCamera | None, u: Tensor, space: InputMapping | None = None
@@ -690,11 +757,7 @@ class Renderer:
     ) -> Tensor:
         """Render the mean radiance of the moments of u, denoised once.
 
-        Rows of a sensor may be read one after the other, so that each row is exposed
-        during some of the moments only. `row_fractions` (H,) of a moment are its
-        fractions of the exposure of each row, which add up to 1 over the moments. The
-        guides of the denoiser are averaged in the same manner. All moments together
-        count as one render.
+        All moments together count as one render.
 
         Args:
             mount: the camera of a rig; None if the scene has one camera.
@@ -703,38 +766,64 @@ class Renderer:
             spp: samples per pixel of all moments together.
             hide_environment: hide the environment behind a backdrop.
         """
-        is_denoised = self.formation.denoiser == "oidn"
         renders_before = self.n_renders
-        # sums over moments, which the first addition makes images
-        exposed = torch.zeros(())
-        guides = torch.zeros(())
-        for index, moment in enumerate(self.moments):
-            inputs = _select_scene_inputs(
-                self._make_camera_inputs(mount, u, moment.input_mapping)
-            )
-            moment_seed = seeds.derive_seed(seed, "moment", index)
-            row_weights = moment.row_fractions[:, None, None]
-            samples = max(1, math.ceil(spp * moment.sample_fraction))
-            exposed = exposed + row_weights * self.render_radiance(
-                inputs, moment_seed, samples, hide_environment, denoised=False
-            )
-            if is_denoised:
-                with torch.no_grad():
-                    guide_seed = seeds.derive_seed(
-                        self.root_seed, "guides", moment_seed
-                    )
-                    albedo, normal = self.scene.render_guides(
-                        inputs, guide_seed, samples
-                    )
-                    moment_guides = torch.cat([albedo, normal], dim=-1)
-                    guides = guides + row_weights * moment_guides
+        renders = self._make_moment_renders(mount, u, seed, spp)
+        exposed, guides = self._sum_moments(renders, hide_environment)
         # `render_radiance` has counted each moment.
         self.n_renders = renders_before + 1
-        if not is_denoised:
+        if self.formation.denoiser != "oidn":
             return exposed
         # Denoising is added as a change without a graph: so the derivative is that of
         # the image before denoising.
         return exposed + self._compute_denoising_change(exposed, guides)
+
+    def _make_moment_renders(
+        self, mount: RigCamera | None, u: Tensor, seed: int, spp: int
+    ) -> Iterator[_MomentRender]:
+        """Yield what is to be rendered of each moment of an exposure.
+
+        The arguments are those of `_render_exposure`.
+        """
+        for index, moment in enumerate(self.moments):
+            inputs = self._make_camera_inputs(mount, u, moment.input_mapping)
+            yield _MomentRender(
+                inputs=_select_scene_inputs(inputs),
+                seed=seeds.derive_seed(seed, "moment", index),
+                spp=max(1, math.ceil(spp * moment.sample_fraction)),
+                row_weights=moment.row_fractions[:, None, None],
+            )
+
+    def _sum_moments(
+        self, renders: Iterable[_MomentRender], hide_environment: bool
+    ) -> tuple[Tensor, Tensor]:
+        """Render the moments of an exposure, and sum their images by the rows' weights.
+
+        Args:
+            renders: what is rendered of each moment.
+            hide_environment: hide the environment behind a backdrop.
+
+        Returns:
+            Radiance (H, W, C), which is not denoised, and the denoiser's guides (H, W,
+            6); the guides are 0 without a denoiser.
+        """
+        # sums over moments, which the first addition makes images
+        exposed = torch.zeros(())
+        guides = torch.zeros(())
+        for render in renders:
+            radiance = self.render_radiance(
+                render.inputs, render.seed, render.spp, hide_environment, denoised=False
+            )
+            exposed = exposed + render.row_weights * radiance
+            if self.formation.denoiser == "oidn":
+                with torch.no_grad():
+                    guides = guides + render.row_weights * self._render_guides(render)
+        return exposed, guides
+
+    def _render_guides(self, render: _MomentRender) -> Tensor:
+        """Render the guides of the denoiser (H, W, 6), albedo and normals, of a moment."""
+        guide_seed = seeds.derive_seed(self.root_seed, "guides", render.seed)
+        albedo, normal = self.scene.render_guides(render.inputs, guide_seed, render.spp)
+        return torch.cat([albedo, normal], dim=-1)
 
     @torch.no_grad()
     def _compute_denoising_change(self, exposed: Tensor, guides: Tensor) -> Tensor:
@@ -772,32 +861,41 @@ class Renderer:
             display: if False, return the radiance before the tone curve.
         """
         inputs = self.replace_photograph_depth(inputs)
-        exposure = inputs.get("camera.exposure")
         if "backdrop.blur" in inputs:
             rendered = blur_image(rendered, float(inputs["backdrop.blur"]))
+        radiance = self._compose_radiance(rendered, inputs)
+        if not display:
+            return radiance
+        image = self.formation.map_to_display(radiance)
+        if "backdrop.noise" in inputs:
+            coverage = rendered[..., 3:4].detach()
+            image = _add_photograph_noise(image, coverage, inputs)
+        return self.space.apply_to_image(u, image)
+
+    def _compose_radiance(
+        self, rendered: Tensor, inputs: Mapping[str, Tensor]
+    ) -> Tensor:
+        """Return rendered radiance (H, W, 3) with exposure, laid over a backdrop.
+
+        Args:
+            rendered: radiance with further channels, as for `finish_image`.
+            inputs: scene inputs, of which exposure and backdrop are applied.
+        """
+        exposure = inputs.get("camera.exposure")
         radiance = rendered[..., :3]
         coat = rendered[..., 7:]  # without channels if the plane is matt
         if exposure is not None:
             radiance = radiance * torch.exp2(exposure)
             coat = coat * torch.exp2(exposure)
-        if "backdrop.color" in inputs:
-            # The photograph is display-linear, which is radiance times the gain, and
-            # has no exposure of ours. Nor has the change of the plane (channels 4 to
-            # 6), which is used relative to the plane's radiance.
-            behind = inputs["backdrop.color"] / self.formation.gain
-            coverage_and_plane = rendered[..., 3:7]
-            layers = torch.cat([radiance, coverage_and_plane, coat], dim=-1)
-            radiance = compose_over_photograph(layers, behind, inputs)
-        if not display:
+        if "backdrop.color" not in inputs:
             return radiance
-        image = self.formation.map_to_display(radiance)
-        if "backdrop.noise" in inputs:
-            # Only where the object is visible: the photograph has its own noise.
-            coverage = rendered[..., 3:4].detach()
-            if "backdrop.front" in inputs:
-                coverage = coverage * (1.0 - inputs["backdrop.front"][..., :1])
-            image = (image + coverage * inputs["backdrop.noise"]).clamp(0.0, 1.0)
-        return self.space.apply_to_image(u, image)
+        # The photograph is display-linear, which is radiance times the gain, and
+        # has no exposure of ours. Nor has the change of the plane (channels 4 to
+        # 6), which is used relative to the plane's radiance.
+        behind = inputs["backdrop.color"] / self.formation.gain
+        coverage_and_plane = rendered[..., 3:7]
+        layers = torch.cat([radiance, coverage_and_plane, coat], dim=-1)
+        return compose_over_photograph(layers, behind, inputs)
 
     @torch.no_grad()
     def replace_photograph_depth(
@@ -813,17 +911,25 @@ class Renderer:
             return inputs
         front_inputs = dict(inputs)
         depth = front_inputs.pop("backdrop.depth")
-        # The depth has n x n points in each pixel of the image.
+        front_inputs["backdrop.front"] = self._find_hidden_fractions(inputs, depth)
+        return front_inputs
+
+    def _find_hidden_fractions(
+        self, inputs: Mapping[str, Tensor], depth: Tensor
+    ) -> Tensor:
+        """Return the fractions (H, W, 2) of object and ground that a photograph hides.
+
+        Args:
+            inputs: inputs of the scene, and the blur of the backdrop if it has one.
+            depth: (n H, n W) depth of the photograph, at n x n points in each pixel.
+        """
         image_height, _image_width = self.formation.resolution
         n_points = depth.shape[0] // image_height
         surfaces = self.scene.find_surfaces(_select_scene_inputs(inputs), n_points)
         blur = float(inputs["backdrop.blur"]) if "backdrop.blur" in inputs else 0.0
         # A blur reaches about three standard deviations; 1 is for the pixel itself.
         radius = 1 + math.ceil(3.0 * blur)
-        front_inputs["backdrop.front"] = compute_front(
-            surfaces, depth, n_points, radius
-        )
-        return front_inputs
+        return compute_front(surfaces, depth, n_points, radius)
 
     def render_radiance(
         self,
@@ -916,25 +1022,28 @@ class Renderer:
         it has a default step: `TURN_STEP` if it is periodic, as an angle over a full
         turn, and else `DEFAULT_STEP`, which `compute_steps` uses for a speed of 0.
         """
-        speeds = torch.zeros(len(self.start))  # pixels per unit of each coordinate
-        coordinates: list[int] = []
-        for group in groups:
-            # "adjoint" and "image" are valid only for groups that move no outline, so
-            # that any other valid estimator is a sign of motion.
-            may_move = {*group.valid} - {"adjoint", "image"}
-            if may_move and group.size <= MAX_MEASURED_SIZE:
-                coordinates += range(group.begin, group.begin + group.size)
-        if motion is not None and coordinates:
-            speeds = motion.measure_speeds(
-                lambda u: self.scene.input_assembler(self.space.inputs(u)),
-                self.start,
-                coordinates,
-            )
+        speeds = self._measure_outline_speeds(groups, motion)
         steps = compute_steps(speeds)
         for group in groups:
             if group.periodic and not bool(speeds[group.coordinates].any()):
                 steps[group.coordinates] = TURN_STEP
         return steps
+
+    def _measure_outline_speeds(
+        self, groups: tuple[Group, ...], motion: Motion | None
+    ) -> Tensor:
+        """Return the speeds (d,) of outlines in pixels per unit of each coordinate.
+
+        They are 0 where they are not measured, see `_list_measured_coordinates`.
+        """
+        coordinates = _list_measured_coordinates(groups)
+        if motion is None or not coordinates:
+            return torch.zeros(len(self.start))
+        return motion.measure_speeds(
+            lambda u: self.scene.input_assembler(self.space.inputs(u)),
+            self.start,
+            coordinates,
+        )
 
     def _find_reached_inputs(
         self, groups: tuple[Group, ...]
@@ -950,28 +1059,63 @@ class Renderer:
         """
         if not any(set(group.valid) & ADJOINT_ESTIMATORS for group in groups):
             return {}
-        routes: dict[str, set[str]] = {group.name: set() for group in groups}
         generator = torch.Generator().manual_seed(0)
-        noise = torch.rand(self.start.shape, generator=generator)
-        # The point is half way from the start to the center, with some noise: at
-        # borders and special values a derivative may be zero by chance. The random
-        # weights keep the derivatives of an input's entries from cancelling in the sum.
-        u = (0.5 * self.start + 0.25 + 0.1 * (noise - 0.5)).requires_grad_()
+        u = self._sample_generic_configuration(generator).requires_grad_()
+        reaching_groups = dict[str, list[str]]()  # names, by that of the scene input
         with torch.enable_grad():
             inputs = self.scene.input_assembler(self.space.inputs(u))
             for name, tensor in inputs.items():
-                if not tensor.requires_grad:
-                    continue
-                weights = torch.rand(tensor.shape, generator=generator)
-                gradient: Tensor | None = torch.autograd.grad(
-                    (tensor * weights).sum(), u, retain_graph=True, allow_unused=True
-                )[0]
-                if gradient is None:
-                    continue
-                for group in groups:
-                    if bool(gradient[group.coordinates].any()):
-                        routes[group.name].add(name)
-        return {name: frozenset(reached) for name, reached in routes.items()}
+                if tensor.requires_grad:
+                    gradient = _differentiate_input_sum(tensor, u, generator)
+                    if gradient is not None:
+                        reaching_groups[name] = _list_reaching_groups(groups, gradient)
+        return {
+            group.name: _find_inputs_of(group.name, reaching_groups) for group in groups
+        }
+
+    def _sample_generic_configuration(self, generator: torch.Generator) -> Tensor:
+        """Sample a configuration (d,) half way from the start to the center of the box.
+
+        It has some noise, since at borders and special values a derivative may be zero
+        by chance.
+        """
+        noise = torch.rand(self.start.shape, generator=generator)
+        configuration: Tensor = 0.5 * self.start + 0.25 + 0.1 * (noise - 0.5)
+        return configuration
+
+
+def _list_reaching_groups(groups: Sequence[Group], gradient: Tensor) -> list[str]:
+    """Return the names of the groups that reach a scene input.
+
+    Args:
+        groups: groups of coordinates.
+        gradient: derivative (d,) of the input by all coordinates.
+    """
+    return [group.name for group in groups if gradient[group.coordinates].any()]
+
+
+def _find_inputs_of(
+    group_name: str, reaching_groups: Mapping[str, Sequence[str]]
+) -> frozenset[str]:
+    """Return the scene inputs that a group of coordinates reaches.
+
+    Args:
+        group_name: name of the group.
+        reaching_groups: names of the groups that reach an input, by the input's name.
+    """
+    return frozenset(
+        name
+        for name, group_names in reaching_groups.items()
+        if group_name in group_names
+    )
+
+
+def _derive_camera_seed(seed: int, index: int) -> int:
+    """Return the seed of the noise of one camera of a rig.
+
+    The first camera has the noise of a scene without a rig.
+    """
+    return seed if index == 0 else seeds.derive_seed(seed, "camera", index)
 
 
 @cache_per_scene
@@ -984,6 +1128,107 @@ def _get_camera_pose_and_center(description: SceneDescription) -> tuple[Tensor, 
     pose = camera_to_world(description)
     center = compute_center(description)
     return torch.from_numpy(pose).float(), torch.from_numpy(center).float()
+
+
+def _check_in_unit_box(u: Tensor) -> None:
+    """Check that all numbers of a configuration are in [0, 1].
+
+    Raises:
+        InputError: one is not, or is NaN.
+    """
+    # An empty configuration has no smallest number. NaN fails both comparisons.
+    is_in_range = True
+    if u.numel():
+        smallest, largest = torch.aminmax(u.detach())
+        is_in_range = bool((smallest >= 0.0) & (largest <= 1.0))
+    if not is_in_range:
+        raise InputError(
+            "render: expected every entry of u in [0, 1]; project u "
+            "before you render it"
+        )
+
+
+def _check_can_have_gradient(u: Tensor) -> None:
+    """Check that a configuration that requires a gradient can have one.
+
+    Raises:
+        InputError: it was made in torch's inference mode.
+    """
+    if u.is_inference() and u.requires_grad:
+        raise InputError(
+            "render: u was made in `torch.inference_mode()`, so that nothing can "
+            "be differentiated with respect to "
+            "it; make it outside, or pass `u.detach()` for the picture alone"
+        )
+
+
+def _list_measured_coordinates(groups: Sequence[Group]) -> list[int]:
+    """Return the coordinates whose motion of outlines is measured.
+
+    Groups of more than `MAX_MEASURED_SIZE` coordinates are left out.
+    """
+    coordinates: list[int] = []
+    for group in groups:
+        # "adjoint" and "image" are valid only for groups that move no outline, so
+        # that any other valid estimator is a sign of motion.
+        may_move = {*group.valid} - {"adjoint", "image"}
+        if may_move and group.size <= MAX_MEASURED_SIZE:
+            coordinates += range(group.begin, group.begin + group.size)
+    return coordinates
+
+
+def _differentiate_input_sum(
+    tensor: Tensor, u: Tensor, generator: torch.Generator
+) -> Tensor | None:
+    """Return the derivative (d,) of a weighted sum of a tensor by u; None without one.
+
+    The random weights keep the derivatives of the entries from cancelling in the sum.
+
+    Args:
+        tensor: tensor with a graph.
+        u: (d,) configuration.
+        generator: samples the weights.
+    """
+    weights = torch.rand(tensor.shape, generator=generator)
+    gradient: Tensor | None = torch.autograd.grad(
+        (tensor * weights).sum(), u, retain_graph=True, allow_unused=True
+    )[0]
+    return gradient
+
+
+def _remove_hidden_surfaces(
+    surfaces: Surfaces, front: Tensor, subdivision: int
+) -> None:
+    """Set the ids of surfaces behind something of a photograph to 0, in place.
+
+    Where something in front hides most of a pixel, no surface of the scene is visible.
+
+    Args:
+        surfaces: surfaces at (subdivision H, subdivision W) points.
+        front: (H, W, 2) hidden fractions of the object and of the ground.
+        subdivision: number of rows and columns of points in a pixel.
+    """
+    is_hidden = front[..., 0] > 0.5
+    for dim in (0, 1):  # a pixel's value for all of its points
+        is_hidden = is_hidden.repeat_interleave(subdivision, dim)
+    surfaces.id[is_hidden] = 0  # no surface; depths stay
+
+
+def _add_photograph_noise(
+    image: Tensor, coverage: Tensor, inputs: Mapping[str, Tensor]
+) -> Tensor:
+    """Add noise to an image where the object is visible.
+
+    The photograph around it has its own noise.
+
+    Args:
+        image: (H, W, 3) sRGB.
+        coverage: (H, W, 1) of the scene's surfaces.
+        inputs: scene inputs with the noise.
+    """
+    if "backdrop.front" in inputs:
+        coverage = coverage * (1.0 - inputs["backdrop.front"][..., :1])
+    return (image + coverage * inputs["backdrop.noise"]).clamp(0.0, 1.0)
 
 
 def _select_scene_inputs(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -1051,35 +1296,13 @@ class _Radiance(torch.autograd.Function):
         ctx.window = renderer.window
         ctx.save_for_backward(*tensors)
         inputs = dict(zip(names, tensors, strict=True))
-        noise_seed = seeds.derive_seed(renderer.root_seed, "primal", seed)
-        guides: Tensor | None = None
-        # another program, which also denoises
-        if renderer._external_render is not None:
-            rendered = renderer._external_render(inputs, noise_seed, spp)
-        else:
-            image_seeds = {"hidden" if hide else "path": noise_seed}
-            if denoised and renderer.formation.denoiser == "oidn":
-                guide_seed = seeds.derive_seed(renderer.root_seed, "guides", seed)
-                image_seeds["guides"] = guide_seed
-            scene: MitsubaScene | SharedPaths = renderer.scene
-            # Shared paths are stored for full images only.
-            if renderer.shared_paths is not None and ctx.window is None:
-                scene = renderer.shared_paths
-            with renderer.scene.limit_window(ctx.window):
-                images = scene.render_images(inputs, image_seeds, spp)
-            # in the order of `image_seeds`
-            rendered = images[0]
-            if "guides" in image_seeds:
-                guides = images[1]
-        rendered = renderer.replace_non_finite(rendered)
-        if guides is not None:
-            rendered = denoise_image(
-                rendered,
-                albedo=guides[..., :3],
-                normal=guides[..., 3:],
-                plane_radiance=renderer.scene.plane_radiance if hide else None,
-                quick=renderer.formation.quick,
-            )
+        needs_guides = denoised and renderer.formation.denoiser == "oidn"
+        image_seeds = _derive_image_seeds(renderer.root_seed, seed, hide, needs_guides)
+        # in the order of `image_seeds`
+        images = _render_seeded_images(renderer, inputs, image_seeds, spp)
+        rendered = renderer.replace_non_finite(images[0])
+        if len(images) > 1:
+            rendered = _denoise_with_guides(renderer, rendered, images[1], hide)
         renderer.n_renders += 1
         return rendered
 
@@ -1095,39 +1318,154 @@ class _Radiance(torch.autograd.Function):
         inputs = dict(zip(ctx.names, ctx.saved_tensors, strict=True))
         noise_seed = seeds.derive_seed(renderer.root_seed, "gradient", ctx.seed)
         cotangent = renderer.replace_non_finite(cotangent)
-        gradient_of_input = dict[str, Tensor]()
-        # The material form is right for more inputs. So it differentiates those that
-        # are reached by groups of both estimators.
-        by_material = _select_reached_inputs(renderer, "material")
-        by_interior = _select_reached_inputs(renderer, "adjoint") - by_material
-        material_names = [name for name in inputs if name in by_material]
-        interior_names = [name for name in inputs if name in by_interior]
-        if material_names:
-            # The result has the vertices and the normals of each mesh, and both are
-            # used. Only the radiance is differentiated, not further channels.
-            meshes = sorted({name.rpartition(".")[0] for name in material_names})
-            gradient_of_input |= renderer.scene.render_material_adjoint(
-                inputs, cotangent[..., :3], noise_seed, ctx.spp, meshes=meshes
-            )
-            renderer.n_gradients += 1
-        if interior_names:
-            method = "hidden" if ctx.hide else "path"
-            with renderer.scene.limit_window(ctx.window):
-                gradient_of_input |= renderer.scene.render_adjoint(
-                    inputs,
-                    cotangent,
-                    noise_seed,
-                    ctx.spp,
-                    wrt=interior_names,
-                    method=method,
-                )
-            renderer.n_gradients += 1
+        gradient_of_input = _render_input_gradients(ctx, inputs, cotangent, noise_seed)
         for name, gradient in gradient_of_input.items():
             gradient_of_input[name] = renderer.replace_non_finite(gradient)
         # The six arguments of `forward` between `ctx` and the tensors have no
         # gradients.
         no_gradients = (None,) * 6
         return (*no_gradients, *map(gradient_of_input.get, ctx.names))
+
+
+def _derive_image_seeds(
+    root_seed: int, seed: int, hide: bool, needs_guides: bool
+) -> dict[str, int]:
+    """Return the seeds of the images that a render takes, by kind; radiance first.
+
+    Args:
+        root_seed: the renderer's seed.
+        seed: seed of the noise of this render.
+        hide: hide the environment behind a backdrop.
+        needs_guides: render the denoiser's guides, too.
+    """
+    noise_seed = seeds.derive_seed(root_seed, "primal", seed)
+    image_seeds = {"hidden" if hide else "path": noise_seed}
+    if needs_guides:
+        image_seeds["guides"] = seeds.derive_seed(root_seed, "guides", seed)
+    return image_seeds
+
+
+def _render_seeded_images(
+    renderer: Renderer,
+    inputs: Mapping[str, Tensor],
+    image_seeds: Mapping[str, int],
+    spp: int,
+) -> list[Tensor]:
+    """Render images of a scene, in the window of the renderer's crop if it has one.
+
+    Another program renders only the radiance, which is the first image, and denoises it
+    itself.
+
+    Args:
+        renderer: renderer of the scene.
+        inputs: inputs of the scene.
+        image_seeds: seed of each image by its kind, such as "path"; radiance first.
+        spp: samples per pixel.
+    """
+    if renderer._external_render is not None:
+        radiance_seed, *_ = image_seeds.values()
+        return [renderer._external_render(inputs, radiance_seed, spp)]
+    scene: MitsubaScene | SharedPaths = renderer.scene
+    # Shared paths are stored for full images only.
+    if renderer.shared_paths is not None and renderer.window is None:
+        scene = renderer.shared_paths
+    with renderer.scene.limit_window(renderer.window):
+        return scene.render_images(inputs, image_seeds, spp)
+
+
+def _denoise_with_guides(
+    renderer: Renderer, rendered: Tensor, guides: Tensor, hide: bool
+) -> Tensor:
+    """Return denoised radiance.
+
+    Args:
+        renderer: renderer of the scene.
+        rendered: (h, w, C) radiance.
+        guides: (h, w, 6) albedo and normals.
+        hide: whether the environment is hidden behind a backdrop.
+    """
+    return denoise_image(
+        rendered,
+        albedo=guides[..., :3],
+        normal=guides[..., 3:],
+        plane_radiance=renderer.scene.plane_radiance if hide else None,
+        quick=renderer.formation.quick,
+    )
+
+
+def _render_input_gradients(
+    ctx: Any, inputs: dict[str, Tensor], cotangent: Tensor, noise_seed: int
+) -> dict[str, Tensor]:
+    """Return the gradients of the inputs that coordinates with an adjoint reach.
+
+    Each of the two adjoints is rendered only if an input needs it. The arguments are
+    those of `_render_material_gradients`.
+    """
+    # The material form is right for more inputs. So it differentiates those that are
+    # reached by groups of both estimators.
+    by_material = _select_reached_inputs(ctx.renderer, "material")
+    by_interior = _select_reached_inputs(ctx.renderer, "adjoint") - by_material
+    material_names = [name for name in inputs if name in by_material]
+    interior_names = [name for name in inputs if name in by_interior]
+    gradient_of_input = dict[str, Tensor]()
+    if material_names:
+        gradient_of_input |= _render_material_gradients(
+            ctx, inputs, cotangent, noise_seed, material_names
+        )
+    if interior_names:
+        gradient_of_input |= _render_interior_gradients(
+            ctx, inputs, cotangent, noise_seed, interior_names
+        )
+    return gradient_of_input
+
+
+def _render_material_gradients(
+    ctx: Any,
+    inputs: dict[str, Tensor],
+    cotangent: Tensor,
+    noise_seed: int,
+    names: Sequence[str],
+) -> dict[str, Tensor]:
+    """Return the gradients of inputs of meshes by the material form; one adjoint render.
+
+    The result has the vertices and the normals of each mesh, and both are used.
+
+    Args:
+        ctx: autograd's context of `_Radiance`.
+        inputs: inputs of the scene.
+        cotangent: (h, w, C) derivative of a loss by the radiance.
+        noise_seed: seed of the noise.
+        names: names of the inputs.
+    """
+    renderer: Renderer = ctx.renderer
+    meshes = sorted({name.rpartition(".")[0] for name in names})
+    # Only the radiance is differentiated, not further channels.
+    gradient_of_input = renderer.scene.render_material_adjoint(
+        inputs, cotangent[..., :3], noise_seed, ctx.spp, meshes=meshes
+    )
+    renderer.n_gradients += 1
+    return gradient_of_input
+
+
+def _render_interior_gradients(
+    ctx: Any,
+    inputs: dict[str, Tensor],
+    cotangent: Tensor,
+    noise_seed: int,
+    names: Sequence[str],
+) -> dict[str, Tensor]:
+    """Return the gradients of inputs by the interior adjoint; one adjoint render.
+
+    The arguments are those of `_render_material_gradients`.
+    """
+    renderer: Renderer = ctx.renderer
+    method = "hidden" if ctx.hide else "path"
+    with renderer.scene.limit_window(ctx.window):
+        gradient_of_input = renderer.scene.render_adjoint(
+            inputs, cotangent, noise_seed, ctx.spp, wrt=names, method=method
+        )
+    renderer.n_gradients += 1
+    return gradient_of_input
 
 
 def _select_reached_inputs(renderer: Renderer, estimator: str) -> frozenset[str]:

@@ -100,21 +100,30 @@ class RigCamera:
         # left, y up): `AXES` converts both sides.
         mount_pose = torch.from_numpy(AXES @ self.pose @ AXES).float()
         mount_pose[:3, 3] /= unit_metres
+        first_to_world = inputs.get("camera.to_world", first_pose)
+        # from the right: from the mount to the first camera, to the world, and around
+        to_world = self._compute_orbit_rotation(center) @ first_to_world @ mount_pose
+        camera_inputs = {**inputs, "camera.to_world": to_world}
+        return {**camera_inputs, **self._make_lens_inputs()}
+
+    def _make_lens_inputs(self) -> dict[str, Tensor]:
+        """Return the scene inputs of the mount's own field of view and lens, if any."""
+        lens_inputs = dict[str, Tensor]()
+        if self.fov is not None:
+            lens_inputs["camera.fov"] = torch.tensor([self.fov])
+        if self.camera_model is not None:
+            lens_inputs["camera.lens"] = torch.tensor(
+                self.camera_model.intrinsics, dtype=torch.float32
+            )
+        return lens_inputs
+
+    def _compute_orbit_rotation(self, center: Tensor) -> Tensor:
+        """Return the rotation (4, 4) about the vertical through a center by the azimuth."""
         orbit_rotation = torch.eye(4)
         orbit_rotation[:3, :3] = torch.from_numpy(make_rotation(self.azimuth, 0.0, 0.0))
         # With the shift c - R c, the rotation leaves the center c where it is.
         orbit_rotation[:3, 3] = center - orbit_rotation[:3, :3] @ center
-        first_to_world = inputs.get("camera.to_world", first_pose)
-        # from the right: from the mount to the first camera, to the world, and around
-        to_world = orbit_rotation @ first_to_world @ mount_pose
-        camera_inputs = {**inputs, "camera.to_world": to_world}
-        if self.fov is not None:
-            camera_inputs["camera.fov"] = torch.tensor([self.fov])
-        if self.camera_model is not None:
-            camera_inputs["camera.lens"] = torch.tensor(
-                self.camera_model.intrinsics, dtype=torch.float32
-            )
-        return camera_inputs
+        return orbit_rotation
 
 
 def read_rig(spec: str) -> tuple[RigCamera, ...]:
@@ -145,6 +154,15 @@ def read_rig(spec: str) -> tuple[RigCamera, ...]:
     has_rig_format = Path(path).suffix.lower() in (".yaml", ".yml")
     if names_single_camera or not has_rig_format:
         return ()
+    return _read_yaml_rig(path)
+
+
+def _read_yaml_rig(path: str) -> tuple[RigCamera, ...]:
+    """Read a rig in our own format, or a camchain; empty if the file has no rig.
+
+    Raises:
+        FileFormatError: it is a rig that cannot be used.
+    """
     try:
         data = parse_yaml(read_text(Path(path), "a camera file", MAX_YAML_BYTES))
     except (OSError, ValueError):
@@ -152,21 +170,28 @@ def read_rig(spec: str) -> tuple[RigCamera, ...]:
         return ()
     if not isinstance(data, dict):
         return ()
-    entries = data.get("cameras")
-    if isinstance(entries, list):  # our own format, which has no other entries
-        if set(data) != {"cameras"}:
-            raise FileFormatError(
-                f"{path}: expected `cameras` alone, got "
-                f"{', '.join(map(str, data))[:80]}"
-            )
-        mounts = tuple(
-            _read_entry(path, index, entry) for index, entry in enumerate(entries)
-        )
+    if isinstance(data.get("cameras"), list):
+        mounts = _read_entries(path, data)
     else:
         mounts = _read_camchain(path, data)
     if mounts:
         _check_mounts(path, mounts)
     return mounts
+
+
+def _read_entries(path: str, data: Mapping[str, Any]) -> tuple[RigCamera, ...]:
+    """Return the cameras of our own format, which has no other entries than `cameras`.
+
+    Raises:
+        FileFormatError: it has others, or one of its cameras cannot be used.
+    """
+    if set(data) != {"cameras"}:
+        raise FileFormatError(
+            f"{path}: expected `cameras` alone, got {', '.join(map(str, data))[:80]}"
+        )
+    return tuple(
+        _read_entry(path, index, entry) for index, entry in enumerate(data["cameras"])
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -340,29 +365,67 @@ def _read_entry(spec: str, index: int, entry: Any) -> RigCamera:
             f"{where}: expected entries among {', '.join(ENTRY_KEYS)}, got "
             f"{str(entry)[:80]!r}"
         )
-    name = entry.get("name", f"camera {index + 1}")
-    if not isinstance(name, str) or not 0 < len(name) <= 40:
-        raise FileFormatError(
-            f"{where}: name: expected a short text, got {str(name)[:80]!r}"
-        )
+    name = _check_camera_name(where, entry.get("name", f"camera {index + 1}"))
     pose = _read_entry_pose(where, entry)
     (orbit_angle,) = _parse_numbers(
         where, "around", [entry.get("around", 0.0)], 1, MAX_TURN
     )
-    fov = None
-    if "fov" in entry:
-        (fov,) = _parse_numbers(where, "fov", [entry["fov"]], 1, MAX_FOV)
-        if fov < MIN_FOV:
-            raise FileFormatError(
-                f"{where}: fov: expected {MIN_FOV:g} to {MAX_FOV:g} degrees, got "
-                f"{fov:g}"
-            )
+    fov = _read_entry_fov(where, entry["fov"]) if "fov" in entry else None
+    delay = _read_entry_delay(where, entry)
+    return RigCamera(name=name, pose=pose, azimuth=orbit_angle, fov=fov, delay=delay)
+
+
+def _check_camera_name(where: str, name: Any) -> str:
+    """Return the name of an entry of our own format, which has to be a short text.
+
+    Args:
+        where: file and camera, for messages.
+        name: the value of `name`, or a default.
+
+    Raises:
+        FileFormatError: it is empty, too long, or no text.
+    """
+    if not isinstance(name, str) or not 0 < len(name) <= 40:
+        raise FileFormatError(
+            f"{where}: name: expected a short text, got {str(name)[:80]!r}"
+        )
+    return name
+
+
+def _read_entry_fov(where: str, value: Any) -> float:
+    """Return the field of view of an entry of our own format, in degrees.
+
+    Args:
+        where: file and camera, for messages.
+        value: the value of `fov`.
+
+    Raises:
+        FileFormatError: it is out of range.
+    """
+    (fov,) = _parse_numbers(where, "fov", [value], 1, MAX_FOV)
+    if fov < MIN_FOV:
+        raise FileFormatError(
+            f"{where}: fov: expected {MIN_FOV:g} to {MAX_FOV:g} degrees, got {fov:g}"
+        )
+    return fov
+
+
+def _read_entry_delay(where: str, entry: Mapping[str, Any]) -> float:
+    """Return the delay of an entry of our own format, in seconds; 0 if it has none.
+
+    Args:
+        where: file and camera, for messages.
+        entry: the entry.
+
+    Raises:
+        FileFormatError: it is out of range.
+    """
     (delay,) = _parse_numbers(where, "later", [entry.get("later", 0.0)], 1, MAX_DELAY)
     if delay < 0.0:
         raise FileFormatError(
             f"{where}: later: expected 0 to {MAX_DELAY:g} seconds, got {delay:g}"
         )
-    return RigCamera(name=name, pose=pose, azimuth=orbit_angle, fov=fov, delay=delay)
+    return delay
 
 
 def _read_entry_pose(where: str, entry: Mapping[str, Any]) -> Float64Array:
@@ -405,20 +468,22 @@ def _parse_numbers(
     Raises:
         FileFormatError: it is no such list.
     """
-    is_valid = (
-        isinstance(value, list)
-        and len(value) == count
-        and all(
-            type(x) in (int, float) and math.isfinite(x) and abs(x) <= limit
-            for x in value
-        )
-    )
-    if not is_valid:
+    has_right_length = isinstance(value, list) and len(value) == count
+    if not has_right_length or not all(_is_within_limit(x, limit) for x in value):
         raise FileFormatError(
             f"{where}: {key}: expected {count} numbers up to {limit:g}, got "
             f"{str(value)[:80]!r}"
         )
     return list(map(float, value))
+
+
+def _is_within_limit(value: Any, limit: float) -> bool:
+    """Return whether a value is a finite number whose absolute value is within a limit.
+
+    Booleans are no numbers.
+    """
+    is_finite = type(value) in (int, float) and math.isfinite(value)
+    return is_finite and bool(abs(value) <= limit)
 
 
 def _to_rows(value: Any) -> list[list[Any]]:
@@ -451,15 +516,29 @@ def _read_camchain(spec: str, data: Mapping[str, Any]) -> tuple[RigCamera, ...]:
     has_extrinsics = all(KALIBR_TRANSFORM in cameras[name] for name in names[1:])
     if not 2 <= len(names) <= MAX_CAMERAS or not has_extrinsics:
         return ()
-    # Each transform leads from the previous camera's coordinates to the camera's.
-    poses = [np.eye(4)]
+    poses = _chain_poses(spec, names, cameras)
+    models = [read_camera(f"{spec}#{name}") for name in names]
+    return _make_mounts(spec, names, poses, models)
+
+
+def _chain_poses(
+    spec: str, names: Sequence[str], cameras: Mapping[str, Mapping[str, Any]]
+) -> list[Float64Array]:
+    """Return the poses (4, 4) of a camchain's cameras relative to the first.
+
+    Args:
+        spec: the file, for messages.
+        names: names of the cameras in their order.
+        cameras: their entries by name. Each but the first has a transform, which leads
+            from the previous camera's coordinates to the camera's.
+    """
+    poses: list[Float64Array] = [np.eye(4)]
     for name in names[1:]:
         from_previous = _parse_rigid(
             f"{spec}: {name}", KALIBR_TRANSFORM, cameras[name][KALIBR_TRANSFORM]
         )
         poses.append(poses[-1] @ np.linalg.inv(from_previous))
-    models = [read_camera(f"{spec}#{name}") for name in names]
-    return _make_mounts(spec, names, poses, models)
+    return poses
 
 
 def _read_transforms(path: str, frame_names: str) -> tuple[RigCamera, ...]:
@@ -552,13 +631,8 @@ def _read_applied_scale(path: str, data: Mapping[str, Any]) -> float:
     """
     scale = 1.0
     if data.get("applied_scale") is not None:
-        (scale,) = _parse_numbers(
-            path,
-            "applied_scale",
-            [data["applied_scale"]],
-            count=1,
-            limit=1.0 / MIN_SCALE,
-        )
+        values = [data["applied_scale"]]
+        (scale,) = _parse_numbers(path, "applied_scale", values, 1, 1.0 / MIN_SCALE)
     if data.get("applied_transform") is not None:
         scale *= _measure_scale(path, data["applied_transform"])
     if not MIN_SCALE <= scale <= 1.0 / MIN_SCALE:
@@ -619,16 +693,30 @@ def _parse_images(path: str) -> dict[str, list[str]]:
     # the last of ten words is the file, whose name may have blanks
     words_of_images = [line.split(maxsplit=9) for line in image_lines]
     words_by_id = {words[0]: words for words in words_of_images}
-    if not words_by_id:
+    _check_different_images(path, len(words_by_id), len(image_lines))
+    return words_by_id
+
+
+def _check_different_images(path: str, n_different: int, n_images: int) -> None:
+    """Check that COLMAP's images.txt has images, each with an id of its own.
+
+    Args:
+        path: the file, for messages.
+        n_different: number of different ids.
+        n_images: number of images.
+
+    Raises:
+        FileFormatError: it has none, or an id twice.
+    """
+    if n_different == 0:
         raise FileFormatError(
             f"{path}: expected 2 to {MAX_CAMERAS} different cameras, got none"
         )
-    if len(words_by_id) < len(image_lines):
+    if n_different < n_images:
         raise FileFormatError(
             f"{path}: expected each image once, got one with the same number twice; "
             "correct the file"
         )
-    return words_by_id
 
 
 def _parse_image(where: str, words: Sequence[str]) -> Float64Array:
@@ -651,17 +739,25 @@ def _parse_image(where: str, words: Sequence[str]) -> Float64Array:
         numbers = list(map(float, words[1:8]))
     except ValueError:
         numbers = []
-    w, x, y, z, *shift = _parse_numbers(where, "pose", numbers, 7, MAX_DISTANCE)
+    *quaternion, tx, ty, tz = _parse_numbers(where, "pose", numbers, 7, MAX_DISTANCE)
+    rotation = _make_unit_rotation(where, quaternion)
+    # inverted, since the file has the map from the world to the camera
+    return np.asarray(np.linalg.inv(make_pose(rotation, [tx, ty, tz])), np.float64)
+
+
+def _make_unit_rotation(where: str, quaternion: Sequence[float]) -> Float64Array:
+    """Return the rotation (3, 3) of a quaternion w, x, y, z.
+
+    Raises FileFormatError: it does not have the length 1. `where` names it.
+    """
+    w, x, y, z = quaternion
     length = math.sqrt(w * w + x * x + y * y + z * z)
     if not 0.99 < length < 1.01:  # it is written with few digits
         raise FileFormatError(
             f"{where}: expected a quaternion of length 1, got one of {length:.3g}"
         )
-    rotation = np.reshape(
-        compute_rotation_entries(x / length, y / length, z / length, w / length), (3, 3)
-    )
-    # inverted, since the file has the map from the world to the camera
-    return np.asarray(np.linalg.inv(make_pose(rotation, shift)), np.float64)
+    entries = compute_rotation_entries(x / length, y / length, z / length, w / length)
+    return np.reshape(entries, (3, 3))
 
 
 def _parse_names(path: str, listing_text: str, known_names: Sequence[str]) -> list[str]:
@@ -681,13 +777,17 @@ def _parse_names(path: str, listing_text: str, known_names: Sequence[str]) -> li
         )
     unknown = [name for name in names if name not in known_names]
     if unknown:
-        listing = ", ".join(known_names[:8])
-        if len(known_names) > 8:
-            listing += ", ..."
+        listing = _join_first_names(known_names)
         raise FileFormatError(
             f"{path}: expected some of its cameras {listing}, got {unknown[0][:40]!r}"
         )
     return names
+
+
+def _join_first_names(names: Sequence[str]) -> str:
+    """Return the first eight of some names with commas, and "..." if there are more."""
+    more = ", ..." if len(names) > 8 else ""
+    return ", ".join(names[:8]) + more
 
 
 def _make_mounts(

@@ -14,7 +14,7 @@ joints that the user sets are applied in addition: about the axes of the object 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property, partial
 from typing import NamedTuple
 
@@ -63,21 +63,13 @@ def find_rig_parameter(name: str) -> Parameter | None:
     if not (owner and dot and component in (*AXES, WEIGHT)):
         return None
     if component == WEIGHT:
+        text = f"Weight of the morph target {owner}."
         return _make_rig_parameter(
-            name,
-            unit="1",
-            low=0.0,
-            high=1.0,
-            default=0.0,
-            text=f"Weight of the morph target {owner}.",
+            name, unit="1", low=0.0, high=1.0, default=0.0, text=text
         )
+    text = f"Turn of the joint {owner} about {component}."
     return _make_rig_parameter(
-        name,
-        unit="degrees",
-        low=-360.0,
-        high=360.0,
-        default=0.0,
-        text=f"Turn of the joint {owner} about {component}.",
+        name, unit="degrees", low=-360.0, high=360.0, default=0.0, text=text
     )
 
 
@@ -107,6 +99,110 @@ class _MeshTarget(NamedTuple):
     rows: Tensor  # (K,) indices of the mesh's vertices that it moves
     offsets: Tensor  # (K, 3) offsets of these at weight 1
 
+    def get_weight(self, clip_weights: Mapping[int, Tensor]) -> Tensor:
+        """Return its weight () in a clip, or at rest if the clip does not set it.
+
+        Args:
+            clip_weights: for each node whose weights the clip sets, the weights (T,) of
+                its targets.
+        """
+        if self.node in clip_weights:
+            return clip_weights[self.node][self.index_in_node]
+        return torch.tensor(self.rest_weight, dtype=torch.float64)
+
+
+def _make_mesh_target(
+    part: Movable, index: int, mesh_vertices: IntArray, part_vertices: IntArray
+) -> _MeshTarget:
+    """Return a morph target of a part, for the vertices of the mesh.
+
+    Args:
+        part: the part.
+        index: index of the target in the part.
+        mesh_vertices: (P,) indices of the mesh's vertices that are of this part.
+        part_vertices: (P,) indices of the same vertices in the part.
+    """
+    target = part.targets[index]
+    # for each vertex of the part the row of its offset; -1 if it has none
+    offset_row_in_part = np.full(len(part.vertices), -1)
+    offset_row_in_part[target.rows] = np.arange(len(target.rows))
+    # the same for each of the mesh's vertices
+    offset_row = offset_row_in_part[part_vertices]
+    is_moved = offset_row >= 0
+    return _MeshTarget(
+        name=target.name,
+        node=part.node,
+        index_in_node=index,
+        rest_weight=float(part.rest_weights[index]),
+        rows=torch.from_numpy(mesh_vertices[is_moved]),
+        offsets=torch.from_numpy(target.offsets[offset_row[is_moved]]),
+    )
+
+
+class _JointArrays(NamedTuple):
+    """Arrays of all parts of a file, for the vertices of a mesh.
+
+    Attributes:
+        points: positions at rest (V, 3).
+        joints: joints (V, n), as indices of `nodes`.
+        weights: their weights (V, n).
+        nodes: (J,) index of each joint's node in the file.
+        inverse_binds: inverse bind matrices (J, 4, 4) of the joints.
+    """
+
+    points: Tensor
+    joints: Tensor
+    weights: Tensor
+    nodes: Tensor
+    inverse_binds: Tensor
+
+    @classmethod
+    def join(cls, parts: Sequence[Movable], vertices: IntArray) -> _JointArrays:
+        """Concatenate the arrays of all parts, and select rows for the mesh.
+
+        Args:
+            parts: parts of the file.
+            vertices: (V,) for each vertex of the mesh its index in the concatenated
+                vertices of all parts.
+        """
+        points = np.concatenate([part.vertices for part in parts])
+        joints = _concatenate_joints(parts)
+        weights = np.concatenate(
+            [_pad_columns(part.weights, joints.shape[1]) for part in parts]
+        )
+        nodes = np.concatenate([part.joint_nodes for part in parts])
+        inverse_binds = np.concatenate([part.inverse_binds for part in parts])
+        return cls(
+            points=torch.from_numpy(points[vertices]),
+            joints=torch.from_numpy(joints[vertices]),
+            weights=torch.from_numpy(weights[vertices]),
+            nodes=torch.from_numpy(nodes),
+            inverse_binds=torch.from_numpy(inverse_binds),
+        )
+
+
+def _concatenate_joints(parts: Sequence[Movable]) -> IntArray:
+    """Return the joints (vertices, n) of all parts, as indices of their joined nodes.
+
+    A joint of a part is an index into the part's list of nodes. The lists of all parts
+    are concatenated. n is the largest number of joints that a vertex has.
+    """
+    max_joints = max(part.joints.shape[1] for part in parts)
+    # index of the first node of each part among those of all parts
+    node_counts = [len(part.joint_nodes) for part in parts]
+    node_starts = np.cumsum(node_counts) - node_counts
+    return np.concatenate(
+        [
+            _pad_columns(part.joints + start, max_joints)
+            for part, start in zip(parts, node_starts, strict=True)
+        ]
+    )
+
+
+def _pad_columns(values: np.ndarray, count: int) -> np.ndarray:
+    """Pad an array (V, n) of joints or weights with zeros to (V, count)."""
+    return np.pad(values, ((0, 0), (0, count - values.shape[1])))
+
 
 class SkeletonRig:
     """Moves the mesh of a glTF file.
@@ -120,10 +216,6 @@ class SkeletonRig:
     ) -> None:
         """Bring the arrays of all parts into the order of the mesh's vertices.
 
-        The arrays become tensors. A joint of a part is an index into the part's list of
-        nodes. Here the lists of all parts are concatenated, and a joint becomes an
-        index into the result, `_nodes`, which has indices of the file's nodes.
-
         Args:
             parts: parts of the file that move with the skeleton; all share it.
             vertices: (V,) for each vertex of the mesh its index in the concatenated
@@ -135,38 +227,14 @@ class SkeletonRig:
         # Rotations that the user sets are about the mesh's axes. To convert them to the
         # file's, `to_mesh` is needed without its scale, the cube root of its
         # determinant.
-        self._rotation_to_mesh = torch.from_numpy(
-            to_mesh / np.cbrt(np.linalg.det(to_mesh))
-        )
-        # The arrays of all parts are concatenated, then rows are selected for the mesh.
-        max_joints = max(part.joints.shape[1] for part in parts)
-
-        def pad_joints(values: np.ndarray) -> np.ndarray:
-            """Pad arrays (V, n) of joints or weights to a common n."""
-            return np.pad(values, ((0, 0), (0, max_joints - values.shape[1])))
-
-        points = np.concatenate([part.vertices for part in parts])
-        # index in `_nodes` of the first node of each part
-        node_counts = [len(part.joint_nodes) for part in parts]
-        node_starts = np.cumsum(node_counts) - node_counts
-        joints = np.concatenate(
-            [
-                pad_joints(part.joints + start)
-                for part, start in zip(parts, node_starts, strict=True)
-            ]
-        )
-        weights = np.concatenate([pad_joints(part.weights) for part in parts])
-        # For each vertex of the mesh: its position at rest (V, 3), its joints (V, n),
-        # which are rows of `_nodes`, and their weights (V, n).
-        self._points = torch.from_numpy(points[vertices])
-        self._joints = torch.from_numpy(joints[vertices])
-        self._weights = torch.from_numpy(weights[vertices])
-        self._nodes = torch.from_numpy(
-            np.concatenate([part.joint_nodes for part in parts])
-        )
-        self._inverse_binds = torch.from_numpy(
-            np.concatenate([part.inverse_binds for part in parts])
-        )
+        unit_to_mesh = to_mesh / np.cbrt(np.linalg.det(to_mesh))
+        self._rotation_to_mesh = torch.from_numpy(unit_to_mesh)
+        arrays = _JointArrays.join(parts, vertices)
+        self._points = arrays.points
+        self._joints = arrays.joints  # rows of `_nodes`
+        self._weights = arrays.weights
+        self._nodes = arrays.nodes
+        self._inverse_binds = arrays.inverse_binds
         self._targets: list[_MeshTarget] = []
         self._add_targets(parts, vertices)
         self._nodes_by_depth = _group_by_depth(self.skeleton.parents)
@@ -206,23 +274,10 @@ class SkeletonRig:
             is_of_part = (vertices >= start) & (vertices < start + n_vertices)
             mesh_vertices = np.flatnonzero(is_of_part)
             part_vertices = vertices[mesh_vertices] - start
-            for index, target in enumerate(part.targets):
-                # for each vertex of the part the row of its offset; -1 if it has none
-                offset_row_in_part = np.full(n_vertices, -1)
-                offset_row_in_part[target.rows] = np.arange(len(target.rows))
-                # the same for each of the mesh's vertices
-                offset_row = offset_row_in_part[part_vertices]
-                is_moved = offset_row >= 0
-                self._targets.append(
-                    _MeshTarget(
-                        name=target.name,
-                        node=part.node,
-                        index_in_node=index,
-                        rest_weight=float(part.rest_weights[index]),
-                        rows=torch.from_numpy(mesh_vertices[is_moved]),
-                        offsets=torch.from_numpy(target.offsets[offset_row[is_moved]]),
-                    )
-                )
+            self._targets += [
+                _make_mesh_target(part, index, mesh_vertices, part_vertices)
+                for index in range(len(part.targets))
+            ]
             start += n_vertices
 
     # ---- Parameters ----
@@ -325,24 +380,40 @@ class SkeletonRig:
                 playing_clip, seconds.to(device)
             )
         local_matrices = self._turn_joints(local_matrices, number_by_name)
-        # (joints, 3, 4) from the rest pose to the scene, without the last row, which is
-        # 0 0 0 1
-        joint_matrices = (
-            self._compute_world(local_matrices)[self._nodes.to(device)]
-            @ self._inverse_binds.to(device)
-        )[:, :3]
+        joint_matrices = self._compute_joint_matrices(local_matrices)
         points = self._compute_morphed_vertices(number_by_name, clip_weights, device)
-        weights = self._weights.to(device)
-        joints = self._joints.to(device)
-        # (V, 3, 4): the weighted mean of the matrices of a vertex's joints
+        matrices = self._blend_joint_matrices(joint_matrices)
+        return (
+            torch.einsum("vij,vj->vi", matrices[:, :, :3], points) + matrices[:, :, 3]
+        )
+
+    def _compute_joint_matrices(self, local_matrices: Tensor) -> Tensor:
+        """Return the matrices (joints, 3, 4) from the rest pose to the scene.
+
+        They are without the last row, which is 0 0 0 1.
+
+        Args:
+            local_matrices: (N, 4, 4) from each node to its parent.
+        """
+        device = local_matrices.device
+        world = self._compute_world(local_matrices)
+        world_of_joint = world[self._nodes.to(device)]
+        return (world_of_joint @ self._inverse_binds.to(device))[:, :3]
+
+    def _blend_joint_matrices(self, joint_matrices: Tensor) -> Tensor:
+        """Return the weighted mean (V, 3, 4) of the matrices of each vertex's joints.
+
+        Args:
+            joint_matrices: (joints, 3, 4).
+        """
+        weights = self._weights.to(joint_matrices.device)
+        joints = self._joints.to(joint_matrices.device)
         matrices = sum(
             weights[:, k, None, None] * joint_matrices[joints[:, k]]
             for k in range(joints.shape[1])
         )
         assert isinstance(matrices, Tensor)
-        return (
-            torch.einsum("vij,vj->vi", matrices[:, :, :3], points) + matrices[:, :, 3]
-        )
+        return matrices
 
     def _compute_morphed_vertices(
         self,
@@ -364,10 +435,7 @@ class SkeletonRig:
             # the parameter's value, or else the clip's, or else that at rest
             weight = number_by_name.get(f"{target.name}.{WEIGHT}")
             if weight is None:
-                if target.node in clip_weights:
-                    weight = clip_weights[target.node][target.index_in_node]
-                else:
-                    weight = torch.tensor(target.rest_weight, dtype=torch.float64)
+                weight = target.get_weight(clip_weights)
             # A weight of 0 changes nothing, and is left out to save time, unless its
             # derivative is required.
             if weight.requires_grad or float(weight) != 0.0:
@@ -388,9 +456,6 @@ class SkeletonRig:
     ) -> tuple[Tensor, dict[int, Tensor]]:
         """Return the poses of nodes and the weights of morph targets in a clip.
 
-        Properties that the clip does not set have their values at rest. A node whose
-        pose is a matrix in the file cannot be animated.
-
         Args:
             clip: the clip.
             seconds: () time since the clip's start.
@@ -398,6 +463,24 @@ class SkeletonRig:
         Returns:
             The matrices (N, 4, 4) of all nodes to their parents; and for each node
             whose weights the clip sets, the weights (T,) of its morph targets.
+        """
+        local_matrices = self._sample_local_matrices(clip, seconds)
+        weights = {
+            track.node: sample_track(track, seconds)
+            for track in clip.tracks
+            if track.path == "weights"
+        }
+        return local_matrices, weights
+
+    def _sample_local_matrices(self, clip: Clip, seconds: Tensor) -> Tensor:
+        """Return the matrices (N, 4, 4) of all nodes to their parents in a clip.
+
+        Properties that the clip does not set have their values at rest. A node whose
+        pose is a matrix in the file cannot be animated.
+
+        Args:
+            clip: the clip.
+            seconds: () time since the clip's start.
         """
         skeleton = self.skeleton
         device = seconds.device
@@ -407,26 +490,16 @@ class SkeletonRig:
             "scale": skeleton.scales,
         }
         properties = {
-            path: torch.from_numpy(values).to(device)
-            for path, values in rest_values.items()
+            path: _replace_animated(
+                torch.from_numpy(rest).to(device), clip, path, seconds
+            )
+            for path, rest in rest_values.items()
         }
-        for path in rest_values:
-            tracks = [track for track in clip.tracks if track.path == path]
-            if tracks:
-                nodes = torch.tensor([track.node for track in tracks], device=device)
-                values = torch.stack([sample_track(track, seconds) for track in tracks])
-                properties[path] = properties[path].index_copy(0, nodes, values)
         composed = _compose_matrices(**properties)
         is_fixed = torch.from_numpy(skeleton.has_matrix).to(device)
-        local_matrices = torch.where(
+        return torch.where(
             is_fixed[:, None, None], self._local_matrices.to(device), composed
         )
-        weights = {
-            track.node: sample_track(track, seconds)
-            for track in clip.tracks
-            if track.path == "weights"
-        }
-        return local_matrices, weights
 
     def _turn_joints(
         self, local_matrices: Tensor, number_by_name: Mapping[str, Tensor]
@@ -440,39 +513,33 @@ class SkeletonRig:
             number_by_name: degrees by names such as "Head.z"; other names are ignored.
         """
         device = local_matrices.device
-        rotation_to_mesh = self._rotation_to_mesh.to(device)
-        # the joints that have a rotation about any axis, each once and in order
-        joints = dict.fromkeys(
-            name.rpartition(".")[0]
-            for name in number_by_name
-            if name.rpartition(".")[2] in AXES
-        )
-        for joint in joints:
+        for joint in _list_turned_joints(number_by_name):
             node = self.node_of_joint[joint]
-            rotation = torch.eye(3, dtype=torch.float64, device=device)
-            for axis in AXES:
-                if f"{joint}.{axis}" in number_by_name:
-                    rotation = (
-                        make_axis_rotation(axis, number_by_name[f"{joint}.{axis}"])
-                        @ rotation
-                    )
-            # The rotation is in the axes of the mesh, and is converted to those of the
-            # file, and then to those of the parent node, in which local matrices are.
-            # If A maps vectors from the new axes to the old ones, a rotation R becomes
-            # A^T R A. The parent's axes are those at rest, also if a clip has moved the
-            # parent: so the axis of the rotation moves with the parent.
-            rotation = rotation_to_mesh.T @ rotation @ rotation_to_mesh
-            parent = int(self.skeleton.parents[node])
-            if parent >= 0:
-                parent_axes = self._axes[parent].to(device)
-                rotation = parent_axes.T @ rotation @ parent_axes
-            matrix = local_matrices[node]
-            upper_rows = torch.cat([rotation @ matrix[:3, :3], matrix[:3, 3:]], dim=1)
-            turned_matrix = torch.cat([upper_rows, matrix[3:]])
+            rotation = _compose_axis_rotations(joint, number_by_name, device)
+            rotation = self._convert_to_parent(rotation, node)
+            turned_matrix = _rotate_linear_part(local_matrices[node], rotation)
             local_matrices = local_matrices.index_copy(
                 0, torch.tensor([node], device=device), turned_matrix[None]
             )
         return local_matrices
+
+    def _convert_to_parent(self, rotation: Tensor, node: int) -> Tensor:
+        """Return a rotation (3, 3) about the mesh's axes in those of a node's parent.
+
+        Local matrices are in the axes of the parent. The parent's axes are those at rest,
+        also if a clip has moved the parent: so the axis of the rotation moves with the
+        parent.
+        """
+        # The rotation is in the axes of the mesh, and is converted to those of the
+        # file, and then to those of the parent node. If A maps vectors from the new axes to
+        # the old ones, a rotation R becomes A^T R A.
+        rotation_to_mesh = self._rotation_to_mesh.to(rotation.device)
+        rotation = rotation_to_mesh.T @ rotation @ rotation_to_mesh
+        parent = int(self.skeleton.parents[node])
+        if parent >= 0:
+            parent_axes = self._axes[parent].to(rotation.device)
+            rotation = parent_axes.T @ rotation @ parent_axes
+        return rotation
 
     def _compute_world(self, local_matrices: Tensor) -> Tensor:
         """Return the matrices (N, 4, 4) from nodes to the scene.
@@ -490,6 +557,64 @@ class SkeletonRig:
                 matrices = world_by_level[-1][parent_rows.to(device)] @ matrices
             world_by_level.append(matrices)
         return torch.cat(world_by_level)[self._node_order.to(device)]
+
+
+def _list_turned_joints(names: Iterable[str]) -> list[str]:
+    """Return the joints that have a rotation about any axis, each once and in order.
+
+    Args:
+        names: names of parameters; those of rotations are such as "Head.z".
+    """
+    split_names = [name.rpartition(".") for name in names]
+    return list(dict.fromkeys(joint for joint, _, axis in split_names if axis in AXES))
+
+
+def _replace_animated(
+    rest_values: Tensor, clip: Clip, path: str, seconds: Tensor
+) -> Tensor:
+    """Return a property of all nodes (N, W), with the values of a clip where it has them.
+
+    Args:
+        rest_values: (N, W) values at rest.
+        clip: the clip.
+        path: name of the property in its tracks, such as "rotation".
+        seconds: () time since the clip's start.
+    """
+    tracks = [track for track in clip.tracks if track.path == path]
+    if not tracks:
+        return rest_values
+    nodes = torch.tensor([track.node for track in tracks], device=seconds.device)
+    values = torch.stack([sample_track(track, seconds) for track in tracks])
+    return rest_values.index_copy(0, nodes, values)
+
+
+def _rotate_linear_part(matrix: Tensor, rotation: Tensor) -> Tensor:
+    """Return a matrix (4, 4) whose linear part is rotated, and whose shift is the same.
+
+    Args:
+        matrix: (4, 4) from a node to its parent.
+        rotation: (3, 3).
+    """
+    upper_rows = torch.cat([rotation @ matrix[:3, :3], matrix[:3, 3:]], dim=1)
+    return torch.cat([upper_rows, matrix[3:]])
+
+
+def _compose_axis_rotations(
+    joint: str, number_by_name: Mapping[str, Tensor], device: torch.device
+) -> Tensor:
+    """Return the rotation (3, 3) of a joint: first about x, then y, then z.
+
+    Args:
+        joint: name of the joint.
+        number_by_name: degrees by names such as "Head.z".
+        device: device of the result.
+    """
+    rotation = torch.eye(3, dtype=torch.float64, device=device)
+    for axis in AXES:
+        degrees = number_by_name.get(f"{joint}.{axis}")
+        if degrees is not None:
+            rotation = make_axis_rotation(axis, degrees) @ rotation
+    return rotation
 
 
 def _group_by_depth(parents: IntArray) -> list[tuple[Tensor, Tensor]]:
@@ -544,12 +669,18 @@ def sample_track(track: Track, seconds: Tensor) -> Tensor:
     fraction = (seconds - times[start_key]) / span
     if track.interpolation == "CUBICSPLINE":
         spline = _interpolate_spline(keys[start_key], keys[end_key], fraction, span)
+        # 1e-12: never divide by 0
         return spline / spline.norm().clamp_min(1e-12) if is_rotation else spline
-    start_value = keys[start_key, value_index]
-    end_value = keys[end_key, value_index]
-    if is_rotation:
-        return slerp(start_value, end_value, fraction)
-    return start_value + fraction * (end_value - start_value)
+    # slerp interpolates on the sphere, lerp along a line
+    interpolate = slerp if is_rotation else lerp
+    return interpolate(
+        keys[start_key, value_index], keys[end_key, value_index], fraction
+    )
+
+
+def lerp(start: Tensor, end: Tensor, fraction: Tensor) -> Tensor:
+    """Interpolate linearly between two values (W,); the fraction () is 0 at the start."""
+    return start + fraction * (end - start)
 
 
 def _interpolate_spline(

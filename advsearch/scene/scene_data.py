@@ -127,14 +127,7 @@ class SceneData:
         object_part = make_mesh_part(
             OBJECT, self.object, compute_object_to_world(self), self.material
         )
-        meshes = {OBJECT: object_part, **around}
-        glasses = {
-            name: mesh for name, mesh in meshes.items() if isinstance(mesh, LampGlass)
-        }
-        return meshes | {
-            name: replace(glass, to_world=meshes[glass.carrier].to_world)
-            for name, glass in glasses.items()
-        }
+        return _move_glasses({OBJECT: object_part, **around})
 
     @cached_property
     def surrounding_meshes(self) -> Mapping[str, MeshPart]:
@@ -185,29 +178,31 @@ class SceneData:
 
     @property
     def photograph(self) -> PhotographedGround | None:
-        """The ground that shows the environment's photograph; None for another ground.
+        """The ground that shows the environment's photograph; None for another ground."""
+        environment = self.environment
+        if environment is None or self.get_number("ground.size") == 0.0:
+            return None
+        if not self._shows_photograph(environment):
+            return None
+        rotation = self.get_number("environment.rotation")
+        return get_photographed_ground(environment, self.capture_height, rotation)
+
+    def _shows_photograph(self, environment: EnvironmentAsset) -> bool:
+        """Return whether the ground shows the photograph of the environment.
 
         The setting `ground.kind` decides if it is set. Otherwise a photographed
         environment has such a ground, with two exceptions: settings describe a table,
         or a plain color hides the environment. The ground would still show the
         photograph then.
         """
-        environment = self.environment
         kind = self.values.get("ground.kind")
-        if environment is None or self.get_number("ground.size") == 0.0:
-            return None
         if kind is not None:
-            shows_photograph = settings.GROUND_KINDS[int(kind)] == settings.PHOTOGRAPH
-        else:
-            shows_photograph = (
-                environment.photographed
-                and not self.backdrop
-                and self.requested.isdisjoint(settings.TABLE_SETTINGS)
-            )
-        if not shows_photograph:
-            return None
-        rotation = self.get_number("environment.rotation")
-        return get_photographed_ground(environment, self.capture_height, rotation)
+            return settings.GROUND_KINDS[int(kind)] == settings.PHOTOGRAPH
+        return (
+            environment.photographed
+            and not self.backdrop
+            and self.requested.isdisjoint(settings.TABLE_SETTINGS)
+        )
 
     @property
     def capture_height(self) -> float:
@@ -228,6 +223,21 @@ class SceneData:
     def material(self) -> Material:
         """The object's material with the `material.*` settings over it."""
         return self.object.material.with_values(self.values, "material.")
+
+
+def _move_glasses(meshes: dict[str, MeshPart]) -> Mapping[str, MeshPart]:
+    """Return meshes in which the glass of lamps has the pose of the car.
+
+    Args:
+        meshes: meshes by name, the cars among them.
+    """
+    glasses = {
+        name: mesh for name, mesh in meshes.items() if isinstance(mesh, LampGlass)
+    }
+    return meshes | {
+        name: replace(glass, to_world=meshes[glass.carrier].to_world)
+        for name, glass in glasses.items()
+    }
 
 
 AnyScene = TypeVar("AnyScene", bound=SceneData)

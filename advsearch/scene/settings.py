@@ -8,7 +8,7 @@ only it knows.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar, TypeGuard
 
@@ -148,20 +148,19 @@ class Parameter:
             periodic: whether `high` is the same as `low`, as for an angle.
             log: whether a search takes even steps of the logarithm.
         """
-        return cls(
-            name=name,
-            shape=(),
-            unit=unit,
-            low=low,
-            high=high,
-            default=default,
-            description=text,
+        still = cls.number(
+            estimators,
+            name,
+            unit,
+            low,
+            high,
+            default,
+            text,
+            search,
             periodic=periodic,
-            moves_silhouettes=True,
-            search=search,
             log=log,
-            estimators=estimators,
         )
+        return replace(still, moves_silhouettes=True)
 
     @classmethod
     def named(
@@ -223,7 +222,6 @@ class Parameter:
             defaults: default values of red, green and blue.
             estimators: valid estimators of the derivative, the preferred one first.
         """
-        descriptions = [f"{name.capitalize()} {text}" for name in CHANNELS]
         return tuple(
             cls(
                 name=name,
@@ -232,13 +230,11 @@ class Parameter:
                 low=low,
                 high=1.0,
                 default=default,
-                description=description,
+                description=f"{name.capitalize()} {text}",
                 search=search,
                 estimators=estimators,
             )
-            for name, default, description in zip(
-                CHANNELS, defaults, descriptions, strict=True
-            )
+            for name, default in zip(CHANNELS, defaults, strict=True)
         )
 
 
@@ -728,26 +724,65 @@ def resolve_settings(settings: SettingValues) -> dict[str, float | None]:
         for name, parameter in SETTINGS.items()
     }
     for name, value in settings.items():
-        setting = find_parameter(name)
-        if setting is None:
-            raise UnknownNameError(
-                "scene parameter", name, SETTINGS, "Write it as `set` NAME=VALUE."
-            )
-        if setting.options:
-            if value not in setting.options:
-                raise UnknownNameError(
-                    name, str(value), setting.options, "Write it as `set` NAME=VALUE."
-                )
-            value = setting.options.index(str(value))
-        unit = "" if setting.unit == "1" else f" ({setting.unit})"
-        allowed_range = f"{setting.low:g} to {setting.high:g}{unit}"
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise InputError(
-                f"`set` {name}: expected a number from {allowed_range}, got {value!r}"
-            )
-        values[name] = float(value)
-        if not setting.low <= value <= setting.high:  # NaN fails, too
-            raise InputError(
-                f"`set` {name}: expected a number from {allowed_range}, got {value:g}"
-            )
+        values[name] = _convert_setting(name, value)
     return values
+
+
+def _convert_setting(name: str, value: object) -> float:
+    """Return the number of a setting; that of a choice is the index of its option.
+
+    Raises:
+        InputError: the value is not valid for the setting.
+        UnknownNameError: there is no such setting.
+    """
+    setting = find_parameter(name)
+    if setting is None:
+        raise UnknownNameError(
+            "scene parameter", name, SETTINGS, "Write it as `set` NAME=VALUE."
+        )
+    if setting.options:
+        value = _find_option_index(name, setting.options, value)
+    return _convert_number(name, setting, value)
+
+
+def _find_option_index(name: str, options: tuple[str, ...], value: object) -> int:
+    """Return the index of a choice among names.
+
+    Args:
+        name: name of the setting, for the message.
+        options: the names.
+        value: the choice.
+
+    Raises:
+        UnknownNameError: it is none of them.
+    """
+    if value not in options:
+        raise UnknownNameError(
+            name, str(value), options, "Write it as `set` NAME=VALUE."
+        )
+    return options.index(str(value))
+
+
+def _convert_number(name: str, setting: Parameter, value: object) -> float:
+    """Return the value of a setting as a number.
+
+    Args:
+        name: name of the setting, for messages.
+        setting: its parameter, which has the range.
+        value: the value.
+
+    Raises:
+        InputError: it is not a finite number inside the range.
+    """
+    unit = "" if setting.unit == "1" else f" ({setting.unit})"
+    allowed_range = f"{setting.low:g} to {setting.high:g}{unit}"
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise InputError(
+            f"`set` {name}: expected a number from {allowed_range}, got {value!r}"
+        )
+    number = float(value)
+    if not setting.low <= value <= setting.high:  # NaN fails, too
+        raise InputError(
+            f"`set` {name}: expected a number from {allowed_range}, got {value:g}"
+        )
+    return number

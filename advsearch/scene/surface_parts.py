@@ -81,17 +81,28 @@ def unwrap(soup: TriangleSoup, chart_group: IntArray | None = None) -> TriangleS
     has_too_many_patches = int(patch.max()) >= _MAX_PATCHES  # counted from 0
     if has_too_many_patches:
         return replace(soup, uvs=_make_grid_uvs(len(soup.faces)))
+    uvs = _unwrap_patches(soup, patch)
+    # An interpolated look-up near a border of the square also reads texels at the
+    # opposite border. xatlas leaves no gap there, so that the charts are shrunk: by
+    # half a gap on each side.
+    margin = 0.5 * ATLAS_PADDING / ATLAS_SIZE
+    return replace(soup, uvs=margin + (1.0 - 2.0 * margin) * np.clip(uvs, 0.0, 1.0))
+
+
+def _unwrap_patches(soup: TriangleSoup, patch: IntArray) -> Float64Array:
+    """Return texture coordinates (F, 3, 2) of faces, patch by patch, from xatlas.
+
+    Args:
+        soup: the faces.
+        patch: (F,) the patch of each face.
+    """
     groups = group_indices(patch)
     atlas = _generate_atlas(soup, groups)
     uvs = np.empty((len(soup.faces), 3, 2))
     for index, group in enumerate(groups):
         _vertices, corners, atlas_uvs = atlas[index]
         uvs[group] = np.asarray(atlas_uvs, dtype=np.float64)[np.asarray(corners)]
-    # An interpolated look-up near a border of the square also reads texels at the
-    # opposite border. xatlas leaves no gap there, so that the charts are shrunk: by
-    # half a gap on each side.
-    margin = 0.5 * ATLAS_PADDING / ATLAS_SIZE
-    return replace(soup, uvs=margin + (1.0 - 2.0 * margin) * np.clip(uvs, 0.0, 1.0))
+    return uvs
 
 
 def _make_grid_uvs(count: int) -> Float64Array:
@@ -127,19 +138,27 @@ def _generate_atlas(soup: TriangleSoup, groups: Sequence[IntArray]) -> xatlas.At
         groups: for each group the indices of its faces.
     """
     for resolution in (ATLAS_SIZE, 0):  # 0: one atlas, however large
-        atlas = xatlas.Atlas()
-        for group in groups:
-            used, corners = np.unique(soup.faces[group], return_inverse=True)
-            atlas.add_mesh(
-                (soup.points[used] * _XATLAS_SCALE).astype(np.float32),
-                corners.reshape(-1, 3).astype(np.uint32),
-            )
         options = xatlas.PackOptions()
         options.resolution = resolution
         options.padding = ATLAS_PADDING
+        atlas = _make_unpacked_atlas(soup, groups)
         atlas.generate(xatlas.ChartOptions(), options)
         if atlas.atlas_count == 1:
             break
+    return atlas
+
+
+def _make_unpacked_atlas(
+    soup: TriangleSoup, groups: Sequence[IntArray]
+) -> xatlas.Atlas:
+    """Return an atlas with a mesh for each group of faces, before it is packed."""
+    atlas = xatlas.Atlas()
+    for group in groups:
+        used, corners = np.unique(soup.faces[group], return_inverse=True)
+        atlas.add_mesh(
+            (soup.points[used] * _XATLAS_SCALE).astype(np.float32),
+            corners.reshape(-1, 3).astype(np.uint32),
+        )
     return atlas
 
 
@@ -178,13 +197,10 @@ def _find_patches(soup: TriangleSoup) -> IntArray:
     left_corner, right_corner, _ = find_shared_edges(soup.faces)
     face = left_corner // 3
     neighbour = right_corner // 3
-    is_flush = (normals[face] * normals[neighbour]).sum(axis=1) > _MIN_FLUSH_COSINE
-    plane = find_components(count, face[is_flush], neighbour[is_flush])
     patch = np.zeros(count, dtype=np.int64)
     # whether both faces of an edge stay in one patch
     is_same = np.ones(len(face), np.bool_)
-    # a large mesh, or a curved surface that would count as one plane
-    if count > _FACES_PER_ATLAS or not _are_straight(normals, plane):
+    if _has_to_be_cut(normals, face, neighbour):
         direction = _find_directions(normals, face, neighbour)
         is_same = direction[face] == direction[neighbour]
         patch = find_components(count, face[is_same], neighbour[is_same])
@@ -193,6 +209,20 @@ def _find_patches(soup: TriangleSoup) -> IntArray:
         return patch
     is_same &= piece[face] == piece[neighbour]
     return find_components(count, face[is_same], neighbour[is_same])
+
+
+def _has_to_be_cut(normals: Float64Array, face: IntArray, neighbour: IntArray) -> bool:
+    """Return whether a mesh is large, or has a curved surface that counts as one plane.
+
+    Args:
+        normals: (F, 3) unit normals of the faces.
+        face: (E,) index of one face of each shared edge.
+        neighbour: (E,) index of the other face.
+    """
+    count = len(normals)
+    is_flush = (normals[face] * normals[neighbour]).sum(axis=1) > _MIN_FLUSH_COSINE
+    plane = find_components(count, face[is_flush], neighbour[is_flush])
+    return count > _FACES_PER_ATLAS or not _are_straight(normals, plane)
 
 
 def _find_directions(
@@ -265,8 +295,6 @@ def _make_cut_directions() -> Float64Array:
 def _halve_patches(centers: Float64Array, patch: IntArray, max_faces: int) -> IntArray:
     """Halve patches until each has at most `max_faces` faces.
 
-    A patch is cut across its longest axis, at the median of its faces' centers.
-
     Args:
         centers: (F, 3) centers of the faces.
         patch: (F,) number of the patch that each face is in.
@@ -281,14 +309,24 @@ def _halve_patches(centers: Float64Array, patch: IntArray, max_faces: int) -> In
     while remaining:
         group = remaining.pop()
         if len(group) > max_faces:
-            axis = np.ptp(centers[group], axis=0).argmax()
-            order = group[np.argsort(centers[group, axis], kind="stable")]
-            middle = len(order) // 2
-            remaining += [order[:middle], order[middle:]]
+            remaining += _halve_group(centers, group)
         else:
             piece_of_face[group] = n_pieces
             n_pieces += 1
     return piece_of_face
+
+
+def _halve_group(centers: Float64Array, group: IntArray) -> list[IntArray]:
+    """Cut a group of faces (n,) across its longest axis, at the median of the centers.
+
+    Args:
+        centers: (F, 3) centers of all faces.
+        group: (n,) indices of the faces of the group.
+    """
+    axis = np.ptp(centers[group], axis=0).argmax()
+    order = group[np.argsort(centers[group, axis], kind="stable")]
+    middle = len(order) // 2
+    return [order[:middle], order[middle:]]
 
 
 MAP_SIZE = 64  # cells along each side of the map
@@ -344,17 +382,9 @@ class SurfaceParts:
         self.n_parts = MAP_SIZE * MAP_SIZE + len(faces)
         self.is_covered = charts.is_covered
         self.face_of_part = np.concatenate([charts.face_index.reshape(-1), faces])
-        face_centers = mesh.vertices[mesh.faces[faces]].mean(axis=1)
-        centers = np.concatenate(
-            [charts.compute_positions().reshape(-1, 3), face_centers]
-        )
-        self.centers = centers.astype(np.float64)
-        # the middle of each cell; row 0 is at v = 1
-        row, column = np.divmod(np.arange(MAP_SIZE * MAP_SIZE), MAP_SIZE)
-        cell_uvs = np.stack(
-            [(column + 0.5) / MAP_SIZE, 1.0 - (row + 0.5) / MAP_SIZE], axis=1
-        )
-        self.center_uvs = np.concatenate([cell_uvs, self.face_uvs[faces].mean(axis=1)])
+        self.centers = _compute_part_centers(charts, mesh, faces)
+        face_center_uvs = self.face_uvs[faces].mean(axis=1)
+        self.center_uvs = np.concatenate([_make_cell_uvs(), face_center_uvs])
 
     @property
     def part_slices(self) -> dict[str, slice]:
@@ -392,6 +422,25 @@ class SurfaceParts:
         return np.asarray(row * MAP_SIZE + column)
 
 
+def _compute_part_centers(charts: Charts, mesh: Mesh, faces: IntArray) -> Float64Array:
+    """Return the centers (count, 3) of the cells of a map, then of faces of a mesh.
+
+    Args:
+        charts: the rasterized map.
+        mesh: the mesh.
+        faces: (F,) indices of the faces that are parts.
+    """
+    cell_centers = charts.compute_positions().reshape(-1, 3)
+    face_centers = mesh.vertices[mesh.faces[faces]].mean(axis=1)
+    return np.concatenate([cell_centers, face_centers]).astype(np.float64)
+
+
+def _make_cell_uvs() -> Float64Array:
+    """Return u and v (cells, 2) of the middle of each cell; row 0 is at v = 1."""
+    row, column = np.divmod(np.arange(MAP_SIZE * MAP_SIZE), MAP_SIZE)
+    return np.stack([(column + 0.5) / MAP_SIZE, 1.0 - (row + 0.5) / MAP_SIZE], axis=1)
+
+
 def _unwrap_mesh(mesh: Mesh) -> Float64Array:
     """Return new texture coordinates (F, 3, 2) of a mesh that do not overlap.
 
@@ -404,17 +453,23 @@ def _unwrap_mesh(mesh: Mesh) -> Float64Array:
     points = (mesh.vertices - lower).astype(np.float64) / extent
     unique_points, unique_index = np.unique(points, axis=0, return_inverse=True)
     faces = unique_index.reshape(-1)[mesh.faces.astype(np.int64)]
+    return unwrap(_make_bare_soup(unique_points, faces)).uvs
+
+
+def _make_bare_soup(points: Float64Array, faces: IntArray) -> TriangleSoup:
+    """Return faces (F, 3) of points (N, 3) as `unwrap` expects them.
+
+    `unwrap` uses points and faces alone: the other fields are fillers.
+    """
     n_faces = len(faces)
-    # `unwrap` uses points and faces alone: the other fields are fillers.
-    soup = TriangleSoup(
-        points=unique_points,
+    return TriangleSoup(
+        points=points,
         faces=faces,
         part_of_face=np.zeros(n_faces, np.int64),
         normals=np.full((n_faces, 3, 3), np.nan),
         uvs=np.full((n_faces, 3, 2), np.nan),
         colors=np.ones((n_faces, 3, 3)),
     )
-    return unwrap(soup).uvs
 
 
 def _rasterise_map(mesh: Mesh, uvs: Float64Array) -> Charts:
@@ -434,8 +489,7 @@ def _has_unique_uvs(mesh: Mesh, uvs: Float64Array) -> bool:
 
     There are four conditions. The coordinates are in the unit square. Almost all of the
     surface has an area in the texture. The faces cover enough of the square, and hardly
-    any of it twice. The last two are tested on a raster of `_TEST_RASTER_SIZE` pixels a
-    side.
+    any of it twice.
 
     Args:
         mesh: the mesh.
@@ -448,6 +502,17 @@ def _has_unique_uvs(mesh: Mesh, uvs: Float64Array) -> bool:
     is_flat = np.abs(compute_doubled_areas(uvs)) < 1e-12
     if areas[is_flat].sum() > MAX_FLAT_FRACTION * areas.sum():
         return False
+    return _covers_map_once(uvs)
+
+
+def _covers_map_once(uvs: Float64Array) -> bool:
+    """Return whether faces cover enough of the unit square, and hardly any of it twice.
+
+    They are tested on a raster of `_TEST_RASTER_SIZE` pixels a side.
+
+    Args:
+        uvs: (F, 3, 2) texture coordinates of the corners of the faces.
+    """
     # The raster has the center of its first pixel at 0. By the negative tolerance a
     # pixel on the border of two faces is in neither.
     _face, row, column, _weights = rasterize_triangles(
@@ -459,7 +524,5 @@ def _has_unique_uvs(mesh: Mesh, uvs: Float64Array) -> bool:
     # several entries.
     n_covered = len(np.unique(row * _TEST_RASTER_SIZE + column))
     n_repeated = len(row) - n_covered
-    return (
-        n_covered >= MIN_COVERED_FRACTION * _TEST_RASTER_SIZE**2
-        and n_repeated <= MAX_DOUBLED_FRACTION * n_covered
-    )
+    covers_enough = n_covered >= MIN_COVERED_FRACTION * _TEST_RASTER_SIZE**2
+    return covers_enough and n_repeated <= MAX_DOUBLED_FRACTION * n_covered

@@ -11,7 +11,7 @@ object.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -101,25 +101,42 @@ def parse_things(things_spec: str | None) -> tuple[RequestedThing, ...]:
     """
     things: list[RequestedThing] = []
     for part in filter(None, map(str.strip, (things_spec or "").split(";"))):
-        thing = _parse_thing(part)
         used_names = [*RESERVED_NAMES, *(other.name for other in things)]
-        has_chosen_name = "name=" in part
-        if thing.name in used_names and has_chosen_name:
-            raise InputError(
-                f"things: {part}: another thing of the scene is called "
-                f"{thing.name}; choose another name"
-            )
-        # car, car-2, car-3: each number replaces the one before. So a name that ends in
-        # "-1", as that of the file "car-1.glb", is followed by "car-2".
-        number = 2
-        while thing.name in used_names:
-            plain_name = thing.name.removesuffix(f"-{number - 1}")
-            thing = replace(thing, name=f"{plain_name}-{number}")
-            number += 1
-        things.append(thing)
+        things.append(_parse_unique_thing(part, used_names))
     if len(things) > MAX_THINGS:
         raise InputError(f"things: expected at most {MAX_THINGS}, got {len(things)}")
     return tuple(things)
+
+
+def _parse_unique_thing(part: str, used_names: Sequence[str]) -> RequestedThing:
+    """Parse one thing, with a number added to its name if that is used.
+
+    Raises:
+        InputError: the thing is not written as `_parse_thing` expects, or the user has
+            chosen a name that is used.
+    """
+    thing = _parse_thing(part)
+    has_chosen_name = "name=" in part
+    if thing.name in used_names and has_chosen_name:
+        raise InputError(
+            f"things: {part}: another thing of the scene is called "
+            f"{thing.name}; choose another name"
+        )
+    return replace(thing, name=_find_unused_name(thing.name, used_names))
+
+
+def _find_unused_name(name: str, used_names: Sequence[str]) -> str:
+    """Return a name, with a number if it is used: car, car-2, car-3.
+
+    Each number replaces the one before. So a name that ends in "-1", as that of the
+    file "car-1.glb", is followed by "car-2".
+    """
+    number = 2
+    while name in used_names:
+        plain_name = name.removesuffix(f"-{number - 1}")
+        name = f"{plain_name}-{number}"
+        number += 1
+    return name
 
 
 def _parse_thing(part: str) -> RequestedThing:
@@ -132,29 +149,12 @@ def _parse_thing(part: str) -> RequestedThing:
     Raises InputError, UnknownNameError: it is not written so, or a number or an option
     is not valid.
     """
-    object_spec, separator, rest = part.rpartition("@")
-    object_spec = object_spec.strip()
-    # X, Y, and then options such as heading=180
-    words = [word.strip() for word in rest.split(",")]
-    option_words = words[2:]
-    has_position = bool(separator) and len(words) >= 2
-    has_options = all("=" in word for word in option_words)
-    if not (object_spec and has_position and has_options):
-        raise InputError(
-            "things: expected WHAT@X,Y in metres, such as car@12,3.5,heading=180, got "
-            f"{part!r}"
-        )
-    options = _parse_options(part, option_words)
+    object_spec, words = _split_thing(part)
+    options = _parse_options(part, words[2:])
     x = _parse_number(part, "x", words[0], -MAX_DISTANCE, MAX_DISTANCE)
     y = _parse_number(part, "y", words[1], -MAX_DISTANCE, MAX_DISTANCE)
-    heading = 0.0
-    if "heading" in options:
-        heading = _parse_number(
-            part, "heading", options["heading"], -MAX_HEADING, MAX_HEADING
-        )
-    size = None
-    if "size" in options:
-        size = _parse_number(part, "size", options["size"], MIN_METRES, MAX_METRES)
+    heading_text = options.get("heading", "0.0")
+    heading = _parse_number(part, "heading", heading_text, -MAX_HEADING, MAX_HEADING)
     # Without `name=` the file's name counts, without what is behind a #, which names a
     # part of the file, as in scene.glb#chair.
     name = make_safe_name(Path(options.get("name") or object_spec.partition("#")[0]))
@@ -163,12 +163,38 @@ def _parse_thing(part: str) -> RequestedThing:
         x=x,
         y=y,
         heading=heading,
-        size=size,
+        size=_parse_size(part, options),
         name=name,
         label=options.get("label"),
         lamps=options.get("lamps", LAMPS_OFF),
         facing=options.get("facing"),
     )
+
+
+def _parse_size(part: str, options: Mapping[str, str]) -> float | None:
+    """Return the size of a thing in metres; None if its options have none."""
+    if "size" not in options:
+        return None
+    return _parse_number(part, "size", options["size"], MIN_METRES, MAX_METRES)
+
+
+def _split_thing(part: str) -> tuple[str, list[str]]:
+    """Split a thing into its object, and the words X, Y and options behind the @.
+
+    Raises InputError: it is not written so.
+    """
+    object_spec, separator, rest = part.rpartition("@")
+    object_spec = object_spec.strip()
+    # X, Y, and then options such as heading=180
+    words = [word.strip() for word in rest.split(",")]
+    has_position = bool(separator) and len(words) >= 2
+    has_options = all("=" in word for word in words[2:])
+    if not (object_spec and has_position and has_options):
+        raise InputError(
+            "things: expected WHAT@X,Y in metres, such as car@12,3.5,heading=180, got "
+            f"{part!r}"
+        )
+    return object_spec, words
 
 
 def _parse_options(part: str, words: Iterable[str]) -> dict[str, str]:
@@ -231,22 +257,28 @@ def add_things(
     requested = parse_things(things_spec)
     if not requested:
         return scene
-    if scene.object.size_in_metres is None:
-        raise InputError(
-            f"things: their positions are in metres from {scene.object_name}, whose "
-            "size is not known; give its longest side in metres, such as `size=0.1`"
-        )
-    parts = list[ThingPart]()
-    remarks = list[str]()
-    for thing in requested:
-        part, thing_remarks = _make_thing(scene, thing, load)
-        parts.append(part)
-        remarks += thing_remarks
+    _check_object_size(scene)
+    things = [_make_thing(scene, thing, load) for thing in requested]
+    parts = [part for part, _ in things]
+    remarks = [remark for _, thing_remarks in things for remark in thing_remarks]
     # `things_spec` is a string here: None has no requested things.
     scene = replace(scene, parts=(*scene.parts, *parts), things_spec=things_spec or "")
     # Overlaps are found in the scene with the things.
     remarks += _list_overlap_remarks(scene)
     return replace(scene, remarks=(*scene.remarks, *remarks))
+
+
+def _check_object_size(scene: SceneData) -> None:
+    """Check that the size of the object is known, as positions are in metres from it.
+
+    Raises:
+        InputError: it is not known.
+    """
+    if scene.object.size_in_metres is None:
+        raise InputError(
+            f"things: their positions are in metres from {scene.object_name}, whose "
+            "size is not known; give its longest side in metres, such as `size=0.1`"
+        )
 
 
 def _make_thing(
@@ -256,9 +288,6 @@ def _make_thing(
 ) -> tuple[ThingPart, list[str]]:
     """Return a thing that stands in a scene, and remarks on it.
 
-    Remarks are notes on its file, doubts about its size and, if the ground has lanes,
-    that its front was guessed.
-
     Args:
         scene: the scene.
         thing: what the user has requested.
@@ -267,8 +296,34 @@ def _make_thing(
     Raises:
         InputError: its size in metres is not known, or its name is taken.
     """
-    object_spec = thing.object_spec
+    asset, metres = _load_sized_asset(thing, load)
     name = thing.name
+    if name in {part.name for part in scene.parts}:
+        raise InputError(
+            f"things: something of the scene is called {name} already; add name=NAME "
+            "to it"
+        )
+    pose = _compute_pose(scene, asset, thing, metres)
+    part = make_mesh_part(name, asset, pose, asset.material)
+    # all fields of the mesh's part, with the label of the thing if it has one
+    fields = {**vars(part), "label": thing.label or asset.label}
+    thing_part = ThingPart(**fields, size_in_metres=metres, lamps=thing.lamps)
+    return thing_part, _list_thing_remarks(scene, thing, asset)
+
+
+def _load_sized_asset(
+    thing: RequestedThing, load: Callable[[str, str | None], ObjectAsset]
+) -> tuple[ObjectAsset, float]:
+    """Load the object of a thing, and return it with its longest side in metres.
+
+    Args:
+        thing: what the user has requested.
+        load: loads an object by its name or file, and the axis that is its front.
+
+    Raises:
+        InputError: its size in metres is not known.
+    """
+    object_spec = thing.object_spec
     asset = with_size(load(object_spec, thing.facing), thing.size, unit=None)
     if asset.size_in_metres is None:
         example = f"{object_spec}@{thing.x:g},{thing.y:g},size=METRES"
@@ -276,15 +331,21 @@ def _make_thing(
             f"things: the size of {object_spec} in metres is not known; say it: "
             f"{example}"
         )
-    if name in {part.name for part in scene.parts}:
-        raise InputError(
-            f"things: something of the scene is called {name} already; add name=NAME "
-            "to it"
-        )
-    pose = _compute_pose(scene, asset, thing, asset.size_in_metres)
-    part = make_mesh_part(name, asset, pose, asset.material)
-    # the fields of the mesh, with the label of the thing if it has one
-    fields = {**vars(part), "label": thing.label or asset.label}
+    return asset, asset.size_in_metres
+
+
+def _list_thing_remarks(
+    scene: SceneData, thing: RequestedThing, asset: ObjectAsset
+) -> list[str]:
+    """Return notes on a thing's file, and doubts about its size and its front.
+
+    That its front was guessed matters if the ground has lanes.
+
+    Args:
+        scene: the scene.
+        thing: what the user has requested.
+        asset: the thing's object.
+    """
     remarks = [
         *asset.notes,
         *describe_size_doubts(
@@ -293,9 +354,7 @@ def _make_thing(
     ]
     if asset.front is not None and asset.front.reason and has_lanes(scene):
         remarks.append(asset.front.reason)
-    return ThingPart(
-        **fields, size_in_metres=asset.size_in_metres, lamps=thing.lamps
-    ), remarks
+    return remarks
 
 
 def _list_overlap_remarks(scene: SceneData) -> list[str]:
@@ -415,6 +474,14 @@ def add_solid_remarks(scene: AnyScene) -> AnyScene:
         for part in scene.parts
         if isinstance(part, ThingPart)
     }
+    remarks = _list_solid_remarks(scene, footprints)
+    return replace(scene, remarks=(*scene.remarks, *remarks))
+
+
+def _list_solid_remarks(
+    scene: SceneData, footprints: Mapping[str, Footprint]
+) -> list[str]:
+    """Return a remark on each footprint that overlaps a solid of the place, by name."""
     remarks = list[str]()
     for name, outline in footprints.items():
         solid = find_overlapping_solid(scene, outline)
@@ -423,7 +490,7 @@ def add_solid_remarks(scene: AnyScene) -> AnyScene:
                 f"{name[0].upper()}{name[1:]} stands in {solid} of the "
                 "place around it: put it elsewhere."
             )
-    return replace(scene, remarks=(*scene.remarks, *remarks))
+    return remarks
 
 
 def list_camera_remarks(
@@ -437,29 +504,44 @@ def list_camera_remarks(
         scene: the scene.
         eyes: positions (3,) of the cameras in metres, at least one.
     """
-    solid_names = list[str]()
-    for eye in eyes:
-        # Overlap is defined for footprints. So the camera is a tiny square, whose
-        # corners are on the axes. Lengths of the scene are in object sizes.
-        x, y, z = eye / scene.size_in_metres
-        corners = np.array(
-            [(x - EYE_SIZE, y), (x, y - EYE_SIZE), (x + EYE_SIZE, y), (x, y + EYE_SIZE)]
-        )
-        solid = find_overlapping_solid(
-            scene, Footprint(corners, z - EYE_SIZE, z + EYE_SIZE)
-        )
-        if solid is not None:
-            solid_names.append(solid)
+    solids_of_eyes = [_find_solid_at(scene, eye) for eye in eyes]
+    solid_names = [solid for solid in solids_of_eyes if solid is not None]
     if not solid_names:
         return ()
-    if len(eyes) == 1:
+    return (_describe_hidden_views(solid_names, len(eyes)),)
+
+
+def _describe_hidden_views(solid_names: Sequence[str], n_views: int) -> str:
+    """Describe in which of the views the camera is inside a solid of the place.
+
+    Args:
+        solid_names: the solid of each such view.
+        n_views: number of all views.
+    """
+    if n_views == 1:
         return (
             f"The camera is inside {solid_names[0]} of the place: it sees no object "
-            "from there; move it.",
+            "from there; move it."
         )
     solids = " or ".join(dict.fromkeys(solid_names))
-    fraction = 100.0 * len(solid_names) / len(eyes)
+    percentage = 100.0 * len(solid_names) / n_views
     return (
-        f"The camera is inside {solids} of the place in {fraction:.0f} % of the views: "
-        "it sees no object from there; narrow where it goes.",
+        f"The camera is inside {solids} of the place in {percentage:.0f} % of the "
+        "views: it sees no object from there; narrow where it goes."
     )
+
+
+def _find_solid_at(scene: SceneData, eye: Float64Array) -> str | None:
+    """Return the solid of the place that a camera is inside; None if it is free.
+
+    Args:
+        scene: the scene.
+        eye: position (3,) of the camera in metres.
+    """
+    # Overlap is defined for footprints. So the camera is a tiny square, whose
+    # corners are on the axes. Lengths of the scene are in object sizes.
+    x, y, z = eye / scene.size_in_metres
+    corners = np.array(
+        [(x - EYE_SIZE, y), (x, y - EYE_SIZE), (x + EYE_SIZE, y), (x, y + EYE_SIZE)]
+    )
+    return find_overlapping_solid(scene, Footprint(corners, z - EYE_SIZE, z + EYE_SIZE))

@@ -99,25 +99,32 @@ def list_bundled(config: CheckConfig) -> Iterator[CheckConfig]:
     Controls that make no sense on a scene are left out.
     """
     for object_name, environment in SCENES:
-        skipped = set()
-        if object_name == "bottle":
-            skipped.add("contents")  # it is closed
-        if environment is not None:
-            skipped.add("sky")  # it would replace the environment
-        for control, control_type in workbench.CONTROLS.items():
-            # Bundled scenes define no parameters for controls without their own.
-            if not control_type.parameters or control in skipped:
-                continue
-            scene_fields = {
-                "object": object_name,
-                "environment": environment,
-                "label": None,
-            }
+        scene_fields = {
+            "object": object_name,
+            "environment": environment,
+            "label": None,
+        }
+        for control in _list_bundled_controls(object_name, environment):
             control_fields = {
                 "controls": {control: {}},
                 **workbench.select_run_settings(config, control, {}),
             }
             yield config.model_copy(update={**scene_fields, **control_fields})
+
+
+def _list_bundled_controls(object_name: str, environment: str | None) -> list[str]:
+    """Return the controls that make sense on a bundled scene."""
+    skipped = set()
+    if object_name == "bottle":
+        skipped.add("contents")  # it is closed
+    if environment is not None:
+        skipped.add("sky")  # it would replace the environment
+    # Bundled scenes define no parameters for controls without their own.
+    return [
+        control
+        for control, control_type in workbench.CONTROLS.items()
+        if control_type.parameters and control not in skipped
+    ]
 
 
 class GradientCheck:
@@ -143,17 +150,11 @@ class GradientCheck:
 
     def _make_result(self, findings: list[Finding]) -> CheckResult:
         """Return the result of what is measured so far."""
-        configs = [part.config for part in self.parts]
-        objects = dict.fromkeys(config.object for config in configs)
-        environments = dict.fromkeys(config.environment_name for config in configs)
-        controls = dict.fromkeys(name for config in configs for name in config.controls)
         plans = _select(findings, SearchPlan)
         lengths = _select(findings, results.PathLength)
         return self.context.result(
             CheckResult,
-            object=",".join(objects),
-            environment=",".join(environments),
-            controls=list(controls),
+            **self._join_scene_names(),
             measured=self.parts_done,
             planned=len(self.parts),
             rows=_select(findings, CheckedRow),
@@ -162,6 +163,18 @@ class GradientCheck:
             gains=_select(findings, GainRow),
             texels=_select(findings, TexelRow),
         )
+
+    def _join_scene_names(self) -> dict[str, Any]:
+        """Return the fields that name the objects, environments and controls, each once."""
+        configs = [part.config for part in self.parts]
+        objects = dict.fromkeys(config.object for config in configs)
+        environments = dict.fromkeys(config.environment_name for config in configs)
+        controls = dict.fromkeys(name for config in configs for name in config.controls)
+        return {
+            "object": ",".join(objects),
+            "environment": ",".join(environments),
+            "controls": list(controls),
+        }
 
     def _measure_parts(self) -> Iterator[Finding]:
         """Yield what is stored of each part, or else measure it."""
@@ -210,14 +223,7 @@ class GradientCheck:
             title: title for the progress.
         """
         config = part.config
-        # A denoiser would change the derivatives.
-        problem, _ = workbench.problem_from_config(config, denoise="none")
-        renderer = problem.renderer
-        # The raw image has no tone curve.
-        renderer.formation = replace(renderer.formation, transfer="linear")
-        # The steps of differences move outlines by at most about a pixel, since the loss
-        # is not linear over wider steps.
-        renderer.plan = renderer.plan.with_pixel_steps()
+        renderer = _make_raw_renderer(config)
         loss = gradients.make_smooth_loss(renderer.formation.resolution, config.seed)
         spp = config.spp if isinstance(config.spp, int) else RAW_SPP
         # The reference takes differences with the planned step and with a wider one.
@@ -265,9 +271,27 @@ class GradientCheck:
 
         if not config.all:
             yield from self._plan_search(problem, part, spp)
-        step_factors = _divide_steps(renderer.plan.groups, default_steps)
+        planned_bench = replace(bench, spp=spp)
+        yield from self._measure_planned(part, title, planned_bench, default_steps)
+
+    def _measure_planned(
+        self,
+        part: CheckedPart,
+        title: str,
+        bench: gradients.Bench,
+        default_steps: dict[str, float],
+    ) -> Iterator[Finding]:
+        """Measure the derivatives of the model's loss with the plan of the renderer.
+
+        Args:
+            part: controls and settings that are measured.
+            title: title for the progress.
+            bench: measures gradients with the samples per pixel of the search.
+            default_steps: default step of each group, by its name.
+        """
+        step_factors = _divide_steps(bench.renderer.plan.groups, default_steps)
         derivatives = gradients.measure_derivatives(
-            replace(bench, spp=spp),
+            bench,
             reference_spp=planning.CONVERGED_SPP,
             reference_repeats=N_MODEL_SEEDS,
             stage=partial(self._begin_stage, title),
@@ -300,13 +324,7 @@ class GradientCheck:
             title: title of the progress.
         """
         plan = problem.renderer.plan
-        # not fewer samples than the search has
-        larger_counts = tuple(
-            count
-            for count in (*planning.SAMPLE_COUNTS, MAX_SPP)
-            if count >= problem.search_spp
-        )
-        counts = larger_counts or (problem.search_spp,)
+        counts = _choose_sample_counts(problem.search_spp)
         self.progress.stage(
             f"{title}: the model's gradients",
             planning.count_cosine_samples(plan, counts=counts),
@@ -332,11 +350,6 @@ class GradientCheck:
             loss: loss that is differentiated.
             spp: samples per pixel.
         """
-
-        def get_or_measure(name: str, measure: Callable[[], Any]) -> Any:
-            """Return what is stored under a name, or else measure and store it."""
-            return self.measurements.get_or_measure(f"{part.key} {name}", measure)
-
         return gradients.Bench(
             renderer,
             loss,
@@ -344,9 +357,19 @@ class GradientCheck:
             gradients.find_interior_point(renderer),
             seeds.derive_seed(part.config.seed, "check"),
             spp,
-            get_or_measure,
+            partial(self._get_or_measure, part.key),
             tick=lambda samples: self.progress.advance(1),
         )
+
+    def _get_or_measure(self, key: str, name: str, measure: Callable[[], Any]) -> Any:
+        """Return what is stored of a part under a name, or else measure and store it.
+
+        Args:
+            key: key of the part.
+            name: name of the measurement.
+            measure: makes the measurement.
+        """
+        return self.measurements.get_or_measure(f"{key} {name}", measure)
 
     def _begin_stage(self, title: str, name: str, max_steps: int) -> None:
         """Begin a stage of the progress; `title` is the title of the part."""
@@ -357,8 +380,6 @@ class GradientCheck:
     ) -> Iterator[Finding]:
         """Yield the plan of a search, its longest light paths, and what it saves.
 
-        There is a row for each item that the rendering leaves out, such as bounces, with
-        the time that this saves. A further row for each texture has its visible texels.
         With `specialise=false` nothing is left out, and only the plan is yielded.
 
         Args:
@@ -366,34 +387,58 @@ class GradientCheck:
             part: part of the check; its key names the stored measurements.
             spp: samples per pixel of the search.
         """
-        config = part.config
         renderer = problem.renderer
         left_out = ["nothing (`specialise=false`)"]
-        if config.specialise:
+        if part.config.specialise:
             left_out = list_left_out(renderer)
         summary = problem.summarize_plan(renderer.plan)
         plan_fields = {**vars(summary), "spp": spp, "left_out": left_out}
         yield SearchPlan(**plan_fields)
-        if not config.specialise:
-            return
-        # Each measurement is read if it is stored, or else made and stored.
+        if part.config.specialise:
+            yield from self._measure_savings(problem, part)
+
+    def _measure_savings(
+        self, problem: Problem, part: CheckedPart
+    ) -> Iterator[Finding]:
+        """Yield the longest light paths of a search, and what it saves.
+
+        There is a row for each item that the rendering leaves out, such as bounces, with
+        the time that this saves. A further row for each texture has its visible texels.
+        Each measurement is read if it is stored, or else made and stored.
+
+        Args:
+            problem: problem of the scene.
+            part: part of the check; its key names the stored measurements.
+        """
         length = self.measurements.get_or_measure_row(
             f"{part.key} bounces",
             results.PathLength,
-            lambda: self._measure_path_length(problem, config.seed),
+            lambda: self._measure_path_length(problem, part.config.seed),
         )
         yield length
-        u = gradients.find_interior_point(renderer)
-        seed = seeds.derive_seed(config.seed, "leaving out")
+        yield from self._measure_omissions(problem, part, length.depth)
+
+    def _measure_omissions(
+        self, problem: Problem, part: CheckedPart, depth: int
+    ) -> Iterator[Finding]:
+        """Yield what each omission saves, and then the visible texels of each texture.
+
+        Args:
+            problem: problem of the scene.
+            part: part of the check; its key names the stored measurements.
+            depth: segments of the longest light path of the search.
+        """
+        u = gradients.find_interior_point(problem.renderer)
+        seed = seeds.derive_seed(part.config.seed, "leaving out")
         yield from self.measurements.get_or_measure_rows(
             f"{part.key} gains",
             GainRow,
-            lambda: self._measure_gains(problem, u, seed, length.depth),
+            lambda: self._measure_gains(problem, u, seed, depth),
         )
         yield from self.measurements.get_or_measure_rows(
             f"{part.key} texels",
             TexelRow,
-            lambda: measure_texels(renderer, u, seed=seed),
+            lambda: measure_texels(problem.renderer, u, seed=seed),
         )
 
     def _measure_path_length(self, problem: Problem, seed: int) -> results.PathLength:
@@ -435,6 +480,30 @@ class GradientCheck:
         )
 
 
+def _make_raw_renderer(config: CheckConfig) -> gradients.Renderer:
+    """Create a renderer of the raw image of a scene, for small steps of differences."""
+    # A denoiser would change the derivatives.
+    problem, _ = workbench.problem_from_config(config, denoise="none")
+    renderer = problem.renderer
+    # The raw image has no tone curve.
+    renderer.formation = replace(renderer.formation, transfer="linear")
+    # The steps of differences move outlines by at most about a pixel, since the loss
+    # is not linear over wider steps.
+    renderer.plan = renderer.plan.with_pixel_steps()
+    return renderer
+
+
+def _choose_sample_counts(search_spp: int) -> tuple[int, ...]:
+    """Return the samples per pixel at which gradients are compared.
+
+    They are not fewer than those of the search.
+    """
+    larger_counts = tuple(
+        count for count in (*planning.SAMPLE_COUNTS, MAX_SPP) if count >= search_spp
+    )
+    return larger_counts or (search_spp,)
+
+
 def _divide_steps(
     groups: Sequence[Any], default_steps: dict[str, float]
 ) -> dict[str, float]:
@@ -457,6 +526,23 @@ def _select(findings: Sequence[Finding], kind: type[FindingType]) -> list[Findin
 def list_left_out(renderer: gradients.Renderer) -> list[str]:
     """Return what a search with the renderer's plan does not compute, in sentences."""
     estimators = {group.estimator for group in renderer.plan.groups}
+    sentences = _list_unneeded_renders(estimators)
+    if not renderer.scene.is_volumetric:
+        sentences.append("the volumetric integrator: there is no medium")
+    if "material" in estimators:
+        # effects that this estimator ignores or approximates
+        sentences += [
+            f"by the material form: {limit}" for limit in renderer.scene.material_limits
+        ]
+    return sentences
+
+
+def _list_unneeded_renders(estimators: set[str]) -> list[str]:
+    """Return what derivatives by some estimators do not need, in sentences.
+
+    Args:
+        estimators: the estimators of all groups of coordinates.
+    """
     sentences = []
     # Of all adjoints, only the estimator "material" differentiates moving outlines.
     if "material" not in estimators:
@@ -470,11 +556,4 @@ def list_left_out(renderer: gradients.Renderer) -> list[str]:
             "renders for differences: every derivative comes from an adjoint or from "
             "the picture itself"
         )
-    if not renderer.scene.is_volumetric:
-        sentences.append("the volumetric integrator: there is no medium")
-    if "material" in estimators:
-        # effects that this estimator ignores or approximates
-        sentences += [
-            f"by the material form: {limit}" for limit in renderer.scene.material_limits
-        ]
     return sentences

@@ -89,16 +89,12 @@ def measure_gains(
     other_seed = seeds.derive_seed(seed, "another")
     for noise_seed in (seed, other_seed):
         for item, variant in variants.items():
-            with torch.no_grad():
-                measurements[item].images.append(variant(u, noise_seed, spp))
-            _, gradient = variant.gradient(loss, u, noise_seed, spp)
-            measurements[item].gradients.append(gradient)
+            measurements[item].add_renders(variant, loss, u, noise_seed, spp)
             tick()
     for number in range(repeats):
+        time_seed = seeds.derive_seed(seed, "round", number)
         for item, variant in variants.items():
-            begin = time.perf_counter()
-            variant.gradient(loss, u, seeds.derive_seed(seed, "round", number), spp)
-            measurements[item].seconds.append(time.perf_counter() - begin)
+            measurements[item].time_gradient(variant, loss, u, time_seed, spp)
             tick()
     search = measurements.pop(SEARCH)
     return [
@@ -127,10 +123,8 @@ def _make_variants(
     if depth != scene.max_depth:
         variants[SEARCH] = renderer.copy_with(scene.copy_with(max_depth=depth))
     for item in ITEMS:
-        other_items = ALL_ITEMS - {item}
-        variants[item] = renderer.copy_with(
-            scene.copy_with(max_depth=depth, leave_out=other_items)
-        )
+        with_item = scene.copy_with(max_depth=depth, leave_out=ALL_ITEMS - {item})
+        variants[item] = renderer.copy_with(with_item)
     leaves_out_bounces = depth < scene.max_depth
     if leaves_out_bounces:
         variants[BOUNCES] = renderer  # its light paths have their full length
@@ -144,13 +138,40 @@ class _Measurements:
 
     Attributes:
         images: images (H, W, 3) at two seeds.
-        gradients: gradients (d,) at two seeds.
+        derivatives: gradients (d,) at two seeds.
         seconds: times of gradients.
     """
 
     images: list[Tensor] = field(default_factory=list)
-    gradients: list[Tensor] = field(default_factory=list)
+    derivatives: list[Tensor] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
+
+    def add_renders(
+        self,
+        variant: gradients.Renderer,
+        loss: gradients.Loss,
+        u: Tensor,
+        seed: int,
+        spp: int,
+    ) -> None:
+        """Add an image and a gradient at a seed."""
+        with torch.no_grad():
+            self.images.append(variant(u, seed, spp))
+        _, gradient = variant.gradient(loss, u, seed, spp)
+        self.derivatives.append(gradient)
+
+    def time_gradient(
+        self,
+        variant: gradients.Renderer,
+        loss: gradients.Loss,
+        u: Tensor,
+        seed: int,
+        spp: int,
+    ) -> None:
+        """Compute a gradient, and add how long that takes."""
+        begin = time.perf_counter()
+        variant.gradient(loss, u, seed, spp)
+        self.seconds.append(time.perf_counter() - begin)
 
 
 def _compare_item(
@@ -169,12 +190,10 @@ def _compare_item(
         with_item: measurements with the renderer that computes the item.
     """
     image_difference = _relative_difference(search.images, with_item.images)
-    gradient_difference = _relative_difference(search.gradients, with_item.gradients)
-    # Two images of the same renderer differ only by noise.
-    search_noise = _seed_difference(search.images)
-    variance_ratio = 1.0
-    if search_noise > 0.0:
-        variance_ratio = (_seed_difference(with_item.images) / search_noise) ** 2
+    gradient_difference = _relative_difference(
+        search.derivatives, with_item.derivatives
+    )
+    variance_ratio = _compute_variance_ratio(search.images, with_item.images)
     seconds = statistics.median(with_item.seconds)
     search_seconds = statistics.median(search.seconds)
     return GainRow(
@@ -186,6 +205,22 @@ def _compare_item(
         safe=max(image_difference, gradient_difference) <= AGREEMENT_LIMIT,
         seconds=seconds,
     )
+
+
+def _compute_variance_ratio(without: list[Tensor], with_item: list[Tensor]) -> float:
+    """Return the variance of an image with an item, over that without it.
+
+    It is 1 if there is no noise without the item.
+
+    Args:
+        without: images at two seeds, without the item.
+        with_item: the same with the item.
+    """
+    # Two images of the same renderer differ only by noise.
+    search_noise = _seed_difference(without)
+    if search_noise > 0.0:
+        return (_seed_difference(with_item) / search_noise) ** 2
+    return 1.0
 
 
 def _seed_difference(pair: list[Tensor]) -> float:
@@ -235,16 +270,26 @@ def measure_texels(
             n_pixels = _count_pixels(renderer, inputs, name, seed, spp)
             n_visible = _count_visible_texels(renderer, inputs, name, seed, spp)
             side = max(inputs[name].shape[:2])
-            rows.append(
-                TexelRow(
-                    control=group.control,
-                    side=side,
-                    seen=n_visible,
-                    pixels=n_pixels,
-                    enough=_find_sufficient_side(side, n_visible, n_pixels),
-                )
-            )
+            rows.append(_make_texel_row(group.control, side, n_visible, n_pixels))
     return rows
+
+
+def _make_texel_row(control: str, side: int, n_visible: int, n_pixels: int) -> TexelRow:
+    """Return the row of a texture, with the side that would suffice.
+
+    Args:
+        control: control that changes the texture.
+        side: side of the texture, in texels.
+        n_visible: number of its visible texels.
+        n_pixels: number of pixels that show it.
+    """
+    return TexelRow(
+        control=control,
+        side=side,
+        seen=n_visible,
+        pixels=n_pixels,
+        enough=_find_sufficient_side(side, n_visible, n_pixels),
+    )
 
 
 def _find_sufficient_side(side: int, n_visible: int, n_pixels: int) -> int:

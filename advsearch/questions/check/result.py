@@ -253,18 +253,10 @@ def make_check_view(result: CheckResult) -> ShownResult:
     It has tables of derivatives, of the model's gradients, of the plan of a search, and
     of what that plan leaves out.
     """
-    sections = [ResultPart(text=[READING] if result.rows else [])]
-    for loss, title in LOSSES.items():
-        derivatives = [
-            row
-            for row in result.rows
-            if row.loss == loss and row.quantity == "derivative"
-        ]
-        sections.append(
-            ResultPart.make_table(derivatives, DERIVATIVE_COLUMNS, title=title)
-        )
     gradient_rows = [row for row in result.rows if row.quantity == "gradient"]
-    sections += [
+    sections = [
+        ResultPart(text=[READING] if result.rows else []),
+        *_make_derivative_tables(result),
         ResultPart.make_table(
             gradient_rows,
             GRADIENT_COLUMNS,
@@ -279,13 +271,32 @@ def make_check_view(result: CheckResult) -> ShownResult:
         ResultPart("Left out", _left_out_texts(result)),
         ResultPart.make_table(result.gains, GAIN_COLUMNS, title="What that saves"),
     ]
-    facts = {}
-    if result.plan is not None:
-        facts = {
-            "renders a gradient": str(result.plan.renders_per_gradient),
-            "samples": str(result.plan.spp),
-        }
-    return ShownResult(_verdict(result), sections, facts)
+    return ShownResult(_verdict(result), sections, _list_costs(result))
+
+
+def _make_derivative_tables(result: CheckResult) -> list[ResultPart]:
+    """Return a table of derivatives for each loss."""
+    tables = []
+    for loss, title in LOSSES.items():
+        derivatives = [
+            row
+            for row in result.rows
+            if row.loss == loss and row.quantity == "derivative"
+        ]
+        tables.append(
+            ResultPart.make_table(derivatives, DERIVATIVE_COLUMNS, title=title)
+        )
+    return tables
+
+
+def _list_costs(result: CheckResult) -> dict[str, str]:
+    """Return the renders and samples of a gradient of the plan, by what they are."""
+    if result.plan is None:
+        return {}
+    return {
+        "renders a gradient": str(result.plan.renders_per_gradient),
+        "samples": str(result.plan.spp),
+    }
 
 
 def _verdict(result: CheckResult) -> str:
@@ -293,13 +304,7 @@ def _verdict(result: CheckResult) -> str:
     sentences = []
     has_parts_left = result.measured < result.planned
     if has_parts_left:
-        stopped = "Stopped"
-        if result.ending == results.OUT_OF_TIME:
-            stopped = "The time was up"
-        sentences.append(
-            f"{stopped} after {result.measured} of {result.planned} parts (a scene, "
-            "its controls and a loss)."
-        )
+        sentences.append(_describe_stop(result))
     names = find_inadequate(result.rows)
     if names:
         sentences.append(f"No estimator is good enough for {', '.join(names)}.")
@@ -307,6 +312,17 @@ def _verdict(result: CheckResult) -> str:
         so_far = "so far " if has_parts_left else ""
         sentences.append(f"Every parameter {so_far}has a good gradient.")
     return " ".join(sentences)
+
+
+def _describe_stop(result: CheckResult) -> str:
+    """Return a sentence about how far the check came, and why it stopped."""
+    stopped = "Stopped"
+    if result.ending == results.OUT_OF_TIME:
+        stopped = "The time was up"
+    return (
+        f"{stopped} after {result.measured} of {result.planned} parts (a scene, "
+        "its controls and a loss)."
+    )
 
 
 def _reason_texts(result: CheckResult) -> list[str]:
@@ -352,6 +368,19 @@ def find_inadequate(rows: Sequence[CheckedRow]) -> list[str]:
     derivatives do not: an attack needs the direction of the gradient. A parameter whose
     best estimator has an unusable reference is not reported, as its errors are unknown.
     """
+    names = dict.fromkeys(
+        f"{row.name} ({row.status})"
+        for row in _find_best_rows(rows)
+        if row.status in ("biased", "noisy")
+    )
+    return list(names)
+
+
+def _find_best_rows(rows: Sequence[CheckedRow]) -> list[CheckedRow]:
+    """Return the row of the best estimator of each parameter and loss.
+
+    Single derivatives of the model's loss are left out.
+    """
     order = ("ok", "reference unusable", "noisy", "biased")  # the best first
     best_rows: dict[tuple[str, ...], CheckedRow] = {}
     for row in rows:
@@ -362,12 +391,7 @@ def find_inadequate(rows: Sequence[CheckedRow]) -> list[str]:
         best = best_rows.get(key)
         if best is None or order.index(row.status) < order.index(best.status):
             best_rows[key] = row
-    names = dict.fromkeys(
-        f"{row.name} ({row.status})"
-        for row in best_rows.values()
-        if row.status in ("biased", "noisy")
-    )
-    return list(names)
+    return list(best_rows.values())
 
 
 def _difference_text(fraction: float) -> str:

@@ -31,6 +31,7 @@ from advsearch.questions.compare.result import (
 )
 
 if TYPE_CHECKING:
+    from advsearch.questions.compare.images import PairImages
     from advsearch.questions.compare.sides import Side
 
 STORED_SWEEP_SETTINGS = (
@@ -113,21 +114,29 @@ class CompareConfig(SweepConfig):
         """
         compares_stored_sweeps = not self.object
         if compares_stored_sweeps:
-            for declared in settings.settings(type(self)):
-                # `field` is the name in Python, `name` the one that users type.
-                is_set = getattr(self, declared.field) != declared.default
-                if is_set and declared.field not in STORED_SWEEP_SETTINGS:
-                    raise InputError(
-                        f"{declared.name}: says how models are shown pictures, and no "
-                        "`object` is named; add `object`, "
-                        "or leave it out to compare stored sweeps"
-                    )
+            self._check_no_sweep_settings()
         elif len(settings.split_names(self.compared)) < 2:
             raise InputError(
                 "compared: expected at least two models, got "
                 f"{self.compared[:60]}; name another one"
             )
         return self
+
+    def _check_no_sweep_settings(self) -> None:
+        """Check that no setting of a new sweep is set.
+
+        Raises:
+            InputError: one is set.
+        """
+        for declared in settings.settings(type(self)):
+            # `field` is the name in Python, `name` the one that users type.
+            is_set = getattr(self, declared.field) != declared.default
+            if is_set and declared.field not in STORED_SWEEP_SETTINGS:
+                raise InputError(
+                    f"{declared.name}: says how models are shown pictures, and no "
+                    "`object` is named; add `object`, "
+                    "or leave it out to compare stored sweeps"
+                )
 
     @property
     def run_name_words(self) -> tuple[str, ...]:
@@ -166,38 +175,64 @@ def compare(context: RunContext[CompareConfig]) -> CompareResult:
     """
     # these import torch and pandas
     from advsearch.questions.compare.images import PairImages
-    from advsearch.questions.compare.pairs import compare_sides
     from advsearch.questions.compare.sides import find_different_settings
 
-    config = context.config
     sides, n_sweep_renders = load_sides(context)
     if not sides:  # the sweep of the models was interrupted
         context.ending = results.INTERRUPTED
     differ = find_different_settings(sides) if sides else []
     warnings = find_comparison_warnings(sides, differ)
-
     images = PairImages(context)
-    # The first side is compared with each of the others.
-    pairs: list[ComparedPair] = []
-    for number, side in enumerate(sides[1:], start=1):
-        context.progress.stage("counting pairs")
-        try:
-            pair = compare_sides(sides[0], side, config.seed)
-        except InputError as error:
-            # scikit-learn, which finds rules, is not installed (`compare_sides`)
-            warnings.append(f"Where one side is worse was not looked for: {error}")
-            pair = compare_sides(sides[0], side, config.seed, with_rules=False)
-        examples = list(images.list_examples(sides[0], side, number))
-        pairs.append(pair.model_copy(update={"discordant_pictures": examples}))
+    pairs = _compare_with_first(images, sides, warnings)
     return context.result(
         CompareResult,
-        **describe_sweeps(config, sides),
+        **describe_sweeps(context.config, sides),
         differ=differ,
         sides=[count_side(side) for side in sides],
         pairs=pairs,
         renders=n_sweep_renders + images.n_rendered,
         warnings=list(dict.fromkeys([*warnings, *images.warnings])),
     )
+
+
+def _compare_with_first(
+    images: PairImages, sides: Sequence[Side], warnings: list[str]
+) -> list[ComparedPair]:
+    """Compare the first side with each of the others.
+
+    Args:
+        images: collects images of pairs, for the run of its context.
+        sides: the sides; there are no pairs without sides.
+        warnings: gets a warning where rules cannot be found.
+    """
+    context = images.context
+    pairs: list[ComparedPair] = []
+    for number, side in enumerate(sides[1:], start=1):
+        context.progress.stage("counting pairs")
+        pair = _count_pair(sides[0], side, context.config.seed, warnings)
+        examples = list(images.list_examples(sides[0], side, number))
+        pairs.append(pair.model_copy(update={"discordant_pictures": examples}))
+    return pairs
+
+
+def _count_pair(
+    first: Side, second: Side, seed: int, warnings: list[str]
+) -> ComparedPair:
+    """Count the pairs of two sides, without rules if scikit-learn is not installed.
+
+    Args:
+        first, second: the sides.
+        seed: seed that splits the pairs in halves.
+        warnings: gets a warning if there are no rules.
+    """
+    from advsearch.questions.compare.pairs import compare_sides  # imports pandas
+
+    try:
+        return compare_sides(first, second, seed)
+    except InputError as error:
+        # scikit-learn, which finds rules, is not installed (`compare_sides`)
+        warnings.append(f"Where one side is worse was not looked for: {error}")
+        return compare_sides(first, second, seed, with_rules=False)
 
 
 def load_sides(context: RunContext[CompareConfig]) -> tuple[list[Side], int]:
@@ -230,16 +265,10 @@ def load_sides(context: RunContext[CompareConfig]) -> tuple[list[Side], int]:
 def describe_sweeps(config: CompareConfig, sides: Sequence[Side]) -> dict[str, Any]:
     """Return the fields of the result that describe the compared sweeps.
 
-    Without sides, since the sweep was interrupted, they follow from the settings.
+    There are no sides if the sweep was interrupted.
     """
     if not sides:
-        return {
-            "environment": config.environment_name,
-            "controls": list(config.controls),
-            "object": config.object,
-            "model": config.compared,
-            "task": config.task_name,
-        }
+        return _describe_planned_sweep(config)
     environments = settings.join_names(side.sweep.summary.environment for side in sides)
     objects = settings.join_names(side.name_by_column["object"] for side in sides)
     models = settings.join_names(side.name_by_column["model"] for side in sides)
@@ -249,6 +278,17 @@ def describe_sweeps(config: CompareConfig, sides: Sequence[Side]) -> dict[str, A
         "object": objects or config.object,
         "model": models or config.compared,
         "task": sides[0].sweep.summary.task,
+    }
+
+
+def _describe_planned_sweep(config: CompareConfig) -> dict[str, Any]:
+    """Return the fields of the result that describe a sweep, from its settings."""
+    return {
+        "environment": config.environment_name,
+        "controls": list(config.controls),
+        "object": config.object,
+        "model": config.compared,
+        "task": config.task_name,
     }
 
 
@@ -282,30 +322,45 @@ def find_comparison_warnings(sides: Sequence[Side], differ: Sequence[str]) -> li
     if not sides:
         return []
     warnings = [text for side in sides for text in side.sweep.summary.warnings]
-    # A difference in one setting is what the comparison is about.
-    if len(differ) > 1:
-        names = f"{', '.join(differ[:-1])} and {differ[-1]}"
-        warnings.append(
-            f"The sweeps differ in {names}: a difference between the sides may come "
-            "from any of these."
-        )
-    if not differ:
-        warnings.append(
-            "The sweeps have the same settings: a difference comes from files, "
-            "versions, or the machine."
-        )
-    rows = sides[0].rows
-    # Rows of one unit, such as the frames of one drive, are not independent.
-    is_of_single_unit = rows["unit"].nunique() == 1
-    if len(rows) > 1 and is_of_single_unit:
-        unit_name = rows.attrs["unit name"]
-        warnings.append(
-            f"All pairs are of one {unit_name}: the fractions are those of this one, "
-            "and show nothing about others."
-        )
+    warnings += _find_setting_warnings(differ)
+    warnings += _find_unit_warnings(sides[0].rows)
     tasks = {side.sweep.summary.task for side in sides}
     if len(tasks) > 1:
         warnings.append(
             f"Different tasks decide what counts as right: {', '.join(sorted(tasks))}."
         )
     return warnings
+
+
+def _find_setting_warnings(differ: Sequence[str]) -> list[str]:
+    """Return a warning if sweeps differ in several settings, or in none.
+
+    A difference in one setting is what a comparison is about.
+    """
+    if not differ:
+        return [
+            "The sweeps have the same settings: a difference comes from files, "
+            "versions, or the machine."
+        ]
+    if len(differ) == 1:
+        return []
+    names = f"{', '.join(differ[:-1])} and {differ[-1]}"
+    return [
+        f"The sweeps differ in {names}: a difference between the sides may come "
+        "from any of these."
+    ]
+
+
+def _find_unit_warnings(rows: Any) -> list[str]:
+    """Return a warning if several rows of a side are all of one unit, such as a drive.
+
+    Rows of one unit, such as the frames of one drive, are not independent.
+    """
+    is_of_single_unit = rows["unit"].nunique() == 1
+    if len(rows) <= 1 or not is_of_single_unit:
+        return []
+    unit_name = rows.attrs["unit name"]
+    return [
+        f"All pairs are of one {unit_name}: the fractions are those of this one, "
+        "and show nothing about others."
+    ]

@@ -58,29 +58,16 @@ class PairImages:
         run = self.context.run
         rows = select_examples(first, second, self.context.config.pictures)
         side_of_letter = {"a": first, "b": second}
-        # The column "number" has the number of each image in its sweep.
-        has_same_images = first.sweep.folder == second.sweep.folder and first.rows[
-            "number"
-        ].equals(second.rows["number"])
-        if has_same_images:  # two models of one sweep: store each image once
+        if _has_same_images(first, second):  # store each image once
             side_of_letter.pop("b")
         files = {
-            row: [
-                f"images/pair-{pair_number}-{row}-{letter}.jpg"
-                for letter in side_of_letter
-            ]
-            for row in rows
+            row: _name_files(pair_number, row, list(side_of_letter)) for row in rows
         }
         self._save_images(rows, list(side_of_letter.values()), files, run)
         for row in rows:
-            right_side = first if first.is_right[row] else second
             is_complete = all((run.path / file).is_file() for file in files[row])
-            yield PairPicture(
-                number=row,
-                values=_round_values(first, row),
-                right=right_side.name,
-                answers=(first.rows["label"][row], second.rows["label"][row]),
-                pictures=files[row] if is_complete else [],
+            yield _make_pair_picture(
+                first, second, row, files[row] if is_complete else []
             )
 
     def _save_images(
@@ -105,13 +92,26 @@ class PairImages:
             for row in rows:
                 for side, file in zip(sides, files[row], strict=True):
                     number = int(side.rows["number"][row])
-                    stored = side.sweep.find_thumbnail(number)
-                    if stored is not None:
-                        # A resumed run copies it again, which is cheap.
-                        run.write_file(file, stored.read_bytes())
-                    elif not (run.path / file).is_file():
+                    is_copied = self._copy_thumbnail(side, number, file)
+                    if not is_copied and not (run.path / file).is_file():
                         missing.append(MissingImage(side, number, file))
             self._render(missing)
+
+    def _copy_thumbnail(self, side: Side, number: int, file: str) -> bool:
+        """Copy an image of a sweep into the run; return whether the sweep has stored it.
+
+        A resumed run copies it again, which is cheap.
+
+        Args:
+            side: side that the image belongs to.
+            number: number of the image in the side's sweep.
+            file: where it is stored, relative to the run directory.
+        """
+        stored = side.sweep.find_thumbnail(number)
+        if stored is None:
+            return False
+        self.context.run.write_file(file, stored.read_bytes())
+        return True
 
     def _render(self, missing: Sequence[MissingImage]) -> None:
         """Render images again, sweep by sweep, so that each scene is loaded once."""
@@ -146,6 +146,39 @@ class PairImages:
             return
         self.context.run.write_file(image.file, scenes.render_thumbnail(image.number))
         self.n_rendered += 1
+
+
+def _name_files(pair_number: int, row: int, letters: Sequence[str]) -> list[str]:
+    """Return the files of the images of a pair, relative to the run, by side."""
+    return [f"images/pair-{pair_number}-{row}-{letter}.jpg" for letter in letters]
+
+
+def _has_same_images(first: Side, second: Side) -> bool:
+    """Return whether the images of two sides are the same: two models of one sweep."""
+    # The column "number" has the number of each image in its sweep.
+    return first.sweep.folder == second.sweep.folder and first.rows["number"].equals(
+        second.rows["number"]
+    )
+
+
+def _make_pair_picture(
+    first: Side, second: Side, row: int, files: list[str]
+) -> PairPicture:
+    """Describe a pair that only one side gets right.
+
+    Args:
+        first, second: the sides.
+        row: index of the pair.
+        files: images of the pair, relative to the run directory.
+    """
+    right_side = first if first.is_right[row] else second
+    return PairPicture(
+        number=row,
+        values=_round_values(first, row),
+        right=right_side.name,
+        answers=(first.rows["label"][row], second.rows["label"][row]),
+        pictures=files,
+    )
 
 
 def _round_values(side: Side, row: int) -> dict[str, str | float]:

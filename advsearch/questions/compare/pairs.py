@@ -41,44 +41,66 @@ def compare_sides(
     Raises:
         InputError: rules are sought and scikit-learn is missing.
     """
-    shared_parameters = [
-        name
-        for name in first.varying_parameters
-        # a parameter that both sides sampled, with the same value in each pair
-        if name in second.rows.attrs["units"]
-        and has_same_values(first.rows[name], second.rows[name])
-    ]
+    shared_parameters = _find_shared_parameters(first, second)
     # Pairs of one unit, such as the frames of a drive, are not independent.
     unit_of_pair = first.rows["unit"].to_numpy()
-    n_units = len(np.unique(unit_of_pair))
-    has_single_pairs = n_units == len(unit_of_pair)
-    # The difference and its interval are also in `count_pairs` below.
+    # `count_pairs` has the difference and its interval.
     _, _, p_value = statistics.clustered.compare_paired(
         first.is_right, second.is_right, unit_of_pair
     )
-    first_rules = None
-    second_rules = None
+    rule_fields: dict[str, Any] = {"worse": None, "better": None}
     if with_rules:
-        table = rules.make_table(first.rows, shared_parameters)
-        only_first_right = first.is_right & ~second.is_right
-        only_second_right = ~first.is_right & second.is_right
-        first_rules = find_pair_rules(table, only_first_right, seed)
-        second_rules = find_pair_rules(table, only_second_right, seed)
+        rule_fields = _find_rules_of_sides(first, second, shared_parameters, seed)
     parts = list[PairPart]()
     for name in shared_parameters:
         parts += count_by_parameter(first, second, name)
     return ComparedPair(
         first=first.name,
         second=second.name,
-        units=None if has_single_pairs else n_units,
+        units=_count_shared_units(unit_of_pair),
         unit=first.rows.attrs["unit name"],
         **count_pairs(first.is_right, second.is_right, unit_of_pair),
         p=p_value,
-        worse=first_rules,
-        better=second_rules,
+        **rule_fields,
         parts=parts,
         discordant_pictures=[],
     )
+
+
+def _count_shared_units(unit_of_pair: IntArray) -> int | None:
+    """Return the number of units of pairs (n,); None if each pair is a unit by itself."""
+    n_units = len(np.unique(unit_of_pair))
+    has_single_pairs = n_units == len(unit_of_pair)
+    return None if has_single_pairs else n_units
+
+
+def _find_shared_parameters(first: Side, second: Side) -> list[str]:
+    """Return the parameters that both sides sampled, with the same value in each pair."""
+    return [
+        name
+        for name in first.varying_parameters
+        if name in second.rows.attrs["units"]
+        and has_same_values(first.rows[name], second.rows[name])
+    ]
+
+
+def _find_rules_of_sides(
+    first: Side, second: Side, parameters: list[str], seed: int
+) -> dict[str, list[PairRule] | None]:
+    """Return the fields `worse` and `better` of a pair of sides.
+
+    Args:
+        first, second: sides with the same sampled scenes, in the same order.
+        parameters: parameters that both sampled.
+        seed: seed that splits the pairs in halves.
+    """
+    table = rules.make_table(first.rows, parameters)
+    only_first_right = first.is_right & ~second.is_right
+    only_second_right = ~first.is_right & second.is_right
+    return {
+        "worse": find_pair_rules(table, only_first_right, seed),
+        "better": find_pair_rules(table, only_second_right, seed),
+    }
 
 
 def count_by_parameter(first: Side, second: Side, name: str) -> Iterator[PairPart]:
@@ -119,25 +141,31 @@ def count_pairs(
     difference, interval, _ = statistics.clustered.compare_paired(
         first_right, second_right, unit_of_pair
     )
-    n_pairs_of_unit = statistics.clustered.sum_per_unit(
-        np.ones(len(unit_of_pair)), unit_of_pair
-    )
-    # The accuracy is the mean over units of the fraction of right pairs in each.
-    accuracies = []
-    for is_right in (first_right, second_right):
-        n_right_of_unit = statistics.clustered.sum_per_unit(is_right, unit_of_pair)
-        accuracies.append(
-            statistics.clustered.mean_rate(n_right_of_unit, n_pairs_of_unit)
-        )
+    first_accuracy = _estimate_accuracy(first_right, unit_of_pair)
+    second_accuracy = _estimate_accuracy(second_right, unit_of_pair)
     return {
         "both": int((first_right & second_right).sum()),
         "first_only": int((first_right & ~second_right).sum()),
         "second_only": int((~first_right & second_right).sum()),
         "neither": int((~first_right & ~second_right).sum()),
-        "shares": tuple(accuracies),  # of the first side and of the second
+        "shares": (first_accuracy, second_accuracy),
         "difference": difference,
         "interval": interval,
     }
+
+
+def _estimate_accuracy(is_right: BoolArray, unit_of_pair: IntArray) -> float:
+    """Return the mean over units of the fraction of right pairs in each.
+
+    Args:
+        is_right: whether a side is right in each pair (n,).
+        unit_of_pair: the unit of each pair (n,).
+    """
+    n_pairs_of_unit = statistics.clustered.sum_per_unit(
+        np.ones(len(unit_of_pair)), unit_of_pair
+    )
+    n_right_of_unit = statistics.clustered.sum_per_unit(is_right, unit_of_pair)
+    return statistics.clustered.mean_rate(n_right_of_unit, n_pairs_of_unit)
 
 
 def split_by_value(
@@ -159,16 +187,28 @@ def split_by_value(
         for name in column.cat.categories:
             yield name, np.asarray(column == name)
     elif edges is not None:
-        bins = np.searchsorted(edges, column, side="right") - 1
-        # Values at the last edge, or beyond one by rounding, are in the part next to it.
-        bins = np.clip(bins, 0, len(edges) - 2)
-        for index, bounds in enumerate(pairwise(edges)):
-            yield bounds, bins == index
+        yield from _split_at_edges(column, edges)
     elif column.nunique() <= MAX_VALUES:
         for value in np.unique(column):
             # so that 0.1 is not printed as 0.10000000149, its nearest float32
             rounded_value = float(f"{value:.6g}")
             yield rounded_value, np.asarray(column == value)
+
+
+def _split_at_edges(
+    column: pd.Series, edges: Sequence[float]
+) -> Iterator[tuple[tuple[float, float], BoolArray]]:
+    """Yield the bounds of each part of a range, and the mask (n,) of the rows in it.
+
+    Args:
+        column: number in each row (n,).
+        edges: ascending bounds of the parts.
+    """
+    bins = np.searchsorted(edges, column, side="right") - 1
+    # Values at the last edge, or beyond one by rounding, are in the part next to it.
+    bins = np.clip(bins, 0, len(edges) - 2)
+    for index, bounds in enumerate(pairwise(edges)):
+        yield bounds, bins == index
 
 
 def find_pair_rules(
@@ -196,18 +236,18 @@ def find_pair_rules(
     found_rules = rules.find_rules(
         choosing, counting, seeds.derive_seed(seed, "compare")
     )
-    pair_rules = []
-    for rule in found_rules.accepted:
-        # `inside` and `elsewhere` are the pairs that meet the rule, and the others.
-        inside = count_exceptions(rule.inside)
-        pair_rules.append(
-            PairRule(
-                conditions=[condition.row for condition in rule.conditions],
-                elsewhere=count_exceptions(rule.elsewhere),
-                **vars(inside),  # count, total, interval and share
-            )
-        )
-    return pair_rules
+    return [_make_pair_rule(rule) for rule in found_rules.accepted]
+
+
+def _make_pair_rule(rule: Any) -> PairRule:
+    """Return the conditions of a rule that was found, with its counts."""
+    # `inside` and `elsewhere` are the pairs that meet the rule, and the others.
+    inside = count_exceptions(rule.inside)
+    return PairRule(
+        conditions=[condition.row for condition in rule.conditions],
+        elsewhere=count_exceptions(rule.elsewhere),
+        **vars(inside),  # count, total, interval and share
+    )
 
 
 def count_exceptions(pairs: pd.DataFrame) -> CountOf:

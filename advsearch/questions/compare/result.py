@@ -214,6 +214,20 @@ def make_compare_view(result: CompareResult) -> ShownResult:
 
     It has a table of all sides, then sections for each pair.
     """
+    sections = [_make_side_table(result)]
+    for pair in result.pairs:
+        sections += _make_pair_sections(pair, has_others=len(result.pairs) > 1)
+    summary = "Interrupted before anything was compared."
+    if result.pairs:
+        summary = summarize_difference(result.pairs[0])
+    sweeps = ", ".join(dict.fromkeys(side.run for side in result.sides))
+    facts = {"sweeps": sweeps, "they differ in": ", ".join(result.differ)}
+    # `says_interrupted`: the summary itself states that the run was interrupted.
+    return ShownResult(summary, sections, facts, says_interrupted=not result.pairs)
+
+
+def _make_side_table(result: CompareResult) -> ResultPart:
+    """Return the table of how often each side is right."""
     columns: dict[str, views.Column] = {
         "": lambda side: side.name,
         "right in": lambda side: f"{side.correct} of {side.configurations}",
@@ -227,18 +241,7 @@ def make_compare_view(result: CompareResult) -> ShownResult:
         columns["the others"] = lambda side: wording.format_outcomes(
             side.outcomes, result.task
         )
-    sections = [
-        ResultPart.make_table(result.sides, columns, title="How often each is right")
-    ]
-    for pair in result.pairs:
-        sections += _make_pair_sections(pair, has_others=len(result.pairs) > 1)
-    summary = "Interrupted before anything was compared."
-    if result.pairs:
-        summary = summarize_difference(result.pairs[0])
-    sweeps = ", ".join(dict.fromkeys(side.run for side in result.sides))
-    facts = {"sweeps": sweeps, "they differ in": ", ".join(result.differ)}
-    # `says_interrupted`: the summary itself states that the run was interrupted.
-    return ShownResult(summary, sections, facts, says_interrupted=not result.pairs)
+    return ResultPart.make_table(result.sides, columns, title="How often each is right")
 
 
 def format_prediction_time(seconds: float) -> str:
@@ -298,7 +301,20 @@ def _make_pair_sections(
     sentences = [describe_exclusive_pairs(pair)]
     if has_others:
         sentences.insert(0, summarize_difference(pair))
-    # a table of 2 x 2: the first side right or wrong, by the second side right or wrong
+    yield _make_pair_table(pair, sentences)
+    yield ResultPart("Where one is worse", [*_describe_rules(pair)])
+    yield from _make_parameter_tables(pair)
+    for name in (pair.first, pair.second):
+        yield from _make_picture_parts(name, pair)
+
+
+def _make_pair_table(pair: ComparedPair, sentences: list[str]) -> ResultPart:
+    """Return the table of one side right or wrong, by the other right or wrong.
+
+    Args:
+        pair: the pair of sides.
+        sentences: text above the table.
+    """
     heads = ["", f"{pair.second} right", f"{pair.second} wrong"]
     rows = [
         [f"{pair.first} right", str(pair.both), str(pair.first_only)],
@@ -308,17 +324,8 @@ def _make_pair_sections(
     if pair.units is not None:
         # `units` is their number and `unit` what one is, such as "drive".
         note = UNITS_NOTE.format(units=f"{pair.unit}s")
-    yield ResultPart(
-        f"{pair.first} and {pair.second}, pair by pair",
-        text=sentences,
-        column_heads=heads,
-        rows=rows,
-        note=note,
-    )
-    yield ResultPart("Where one is worse", [*_describe_rules(pair)])
-    yield from _make_parameter_tables(pair)
-    for name in (pair.first, pair.second):
-        yield from _make_picture_parts(name, pair)
+    title = f"{pair.first} and {pair.second}, pair by pair"
+    return ResultPart(title, text=sentences, column_heads=heads, rows=rows, note=note)
 
 
 def _make_parameter_tables(pair: ComparedPair) -> Iterator[ResultPart]:
@@ -327,14 +334,26 @@ def _make_parameter_tables(pair: ComparedPair) -> Iterator[ResultPart]:
     A page shows all tables. A terminal shows those of the `MAX_TABLES` parameters over
     whose values the difference varies most, and a sentence that the page has more.
     """
-    parts_by_title: dict[str, list[PairPart]] = {}
-    for part in pair.parts:
-        # The unit is "1" for plain numbers and "name" for names.
-        has_unit = part.unit not in ("", "1", "name")
-        title = f"{part.parameter}, {part.unit}" if has_unit else part.parameter
-        parts_by_title.setdefault(title, []).append(part)
+    parts_by_title = _group_parts(pair.parts)
     titles_in_terminal = _find_most_varying(parts_by_title)
-    heads = [
+    heads = _list_part_heads(pair)
+    for title, parts in parts_by_title.items():
+        rows = [_make_part_cells(part) for part in parts]
+        # An empty `only` shows the table on the page and in a terminal.
+        only = "" if title in titles_in_terminal else "page"
+        yield ResultPart(title, column_heads=heads, rows=rows, only_medium=only)
+    n_parameters = len(parts_by_title)
+    if len(titles_in_terminal) < n_parameters:
+        remark = (
+            "The difference varies most over these; the page has all "
+            f"{n_parameters} parameters."
+        )
+        yield ResultPart(text=[remark], only_medium="text")
+
+
+def _list_part_heads(pair: ComparedPair) -> list[str]:
+    """Return the heads of the columns of a parameter's table; see `_make_part_cells`."""
+    return [
         "",
         "pairs",
         pair.first,
@@ -343,17 +362,17 @@ def _make_parameter_tables(pair: ComparedPair) -> Iterator[ResultPart]:
         f"{pair.first} alone",
         f"{pair.second} alone",
     ]
-    for title, parts in parts_by_title.items():
-        rows = [_make_part_cells(part) for part in parts]
-        # An empty `only` shows the table on the page and in a terminal.
-        only = "" if title in titles_in_terminal else "page"
-        yield ResultPart(title, column_heads=heads, rows=rows, only_medium=only)
-    if len(titles_in_terminal) < len(parts_by_title):
-        remark = (
-            "The difference varies most over these; the page has all "
-            f"{len(parts_by_title)} parameters."
-        )
-        yield ResultPart(text=[remark], only_medium="text")
+
+
+def _group_parts(parts: Sequence[PairPart]) -> dict[str, list[PairPart]]:
+    """Return the counts of each parameter by the title of its table."""
+    parts_by_title: dict[str, list[PairPart]] = {}
+    for part in parts:
+        # The unit is "1" for plain numbers and "name" for names.
+        has_unit = part.unit not in ("", "1", "name")
+        title = f"{part.parameter}, {part.unit}" if has_unit else part.parameter
+        parts_by_title.setdefault(title, []).append(part)
+    return parts_by_title
 
 
 def _find_most_varying(parts_by_title: Mapping[str, Sequence[PairPart]]) -> list[str]:
@@ -455,23 +474,33 @@ def _make_picture_parts(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
         pair: pair of both sides.
     """
     title = f"Only {name} gets right:"
-    text_rows: list[list[str]] = []
-    lines_without_pictures: list[str] = []
-    groups: list[list[views.Picture]] = []
-    for example in pair.discordant_pictures:
-        if example.right != name:
-            continue
-        line = "; ".join([*_make_captions(example, pair), _format_values(example)])
-        text_rows.append([line, *example.pictures])
-        if example.pictures:
-            groups.append(_group_pictures(example, pair))
-        else:
-            lines_without_pictures.append(line)
-    has_single_images = groups and all(len(group) == 1 for group in groups)
-    if has_single_images:
-        groups = [[group[0] for group in groups]]
+    examples = [
+        example for example in pair.discordant_pictures if example.right == name
+    ]
+    text_rows = [
+        [_describe_example(example, pair), *example.pictures] for example in examples
+    ]
+    lines_without_pictures = [
+        _describe_example(example, pair) for example in examples if not example.pictures
+    ]
+    groups = _join_single_pictures(
+        [_group_pictures(example, pair) for example in examples if example.pictures]
+    )
     yield ResultPart(title, rows=text_rows[:MAX_PICTURES], only_medium="text")
     yield ResultPart(title, lines_without_pictures, pictures=groups, only_medium="page")
+
+
+def _describe_example(example: PairPicture, pair: ComparedPair) -> str:
+    """Return what each side predicts for a pair, and the values of its parameters."""
+    return "; ".join([*_make_captions(example, pair), _format_values(example)])
+
+
+def _join_single_pictures(
+    groups: list[list[views.Picture]],
+) -> list[list[views.Picture]]:
+    """Return groups of images as one group if each has a single image, else as they are."""
+    has_single_images = groups and all(len(group) == 1 for group in groups)
+    return [[group[0] for group in groups]] if has_single_images else groups
 
 
 def _group_pictures(example: PairPicture, pair: ComparedPair) -> list[views.Picture]:
@@ -493,22 +522,44 @@ def _group_pictures(example: PairPicture, pair: ComparedPair) -> list[views.Pict
 def make_compare_claims(result: CompareResult) -> Iterator[views.Claim]:
     """Yield a claim for each pair, about the accuracy of its second side."""
     for pair in result.pairs:
-        # Without units, pairs are independent.
-        method = "Newcombe's, of pairs" if pair.units is None else f"over {pair.unit}s"
-        statement = (
-            f"{summarize_difference(pair)} {describe_exclusive_pairs(pair)} The "
-            f"interval of the difference is {method}."
-        )
         second = next(side for side in result.sides if side.name == pair.second)
-        outcomes = wording.format_outcomes(second.outcomes, result.task)
-        if outcomes:
-            statement += f" Of the others {pair.second} has {outcomes}."
-        extent = results.Extent.from_count(
-            f"configurations in which {pair.second} is right",
-            second.correct,
-            second.configurations,
-            second.interval,
-            second.accuracy,
-            counts_right=True,
-        )
-        yield views.Claim(kind="measured", statement=statement, extent=extent)
+        yield _make_pair_claim(pair, second, result.task)
+
+
+def _make_pair_claim(
+    pair: ComparedPair, second: ComparedSide, task: str
+) -> views.Claim:
+    """Return the claim about the accuracy of the second side of a pair.
+
+    Args:
+        pair: the pair.
+        second: its second side.
+        task: the task that evaluates the predictions.
+    """
+    extent = results.Extent.from_count(
+        f"configurations in which {pair.second} is right",
+        second.correct,
+        second.configurations,
+        second.interval,
+        second.accuracy,
+        counts_right=True,
+    )
+    statement = _state_difference(pair, second, task)
+    return views.Claim(kind="measured", statement=statement, extent=extent)
+
+
+def _state_difference(pair: ComparedPair, second: ComparedSide, task: str) -> str:
+    """State the difference of a pair, and what its second side gets wrong.
+
+    The arguments are those of `_make_pair_claim`.
+    """
+    # Without units, pairs are independent.
+    method = "Newcombe's, of pairs" if pair.units is None else f"over {pair.unit}s"
+    statement = (
+        f"{summarize_difference(pair)} {describe_exclusive_pairs(pair)} The "
+        f"interval of the difference is {method}."
+    )
+    outcomes = wording.format_outcomes(second.outcomes, task)
+    if outcomes:
+        statement += f" Of the others {pair.second} has {outcomes}."
+    return statement

@@ -102,21 +102,46 @@ def read_sides(paths: Sequence[Path]) -> list[Side]:
         for folder in paths
         for side in read_sweep_sides(folder, is_only_sweep=len(paths) == 1)
     ]
+    _check_can_be_compared(sides, paths[0])
+    for side in sides[1:]:
+        check_same_draws(sides[0], side)
+    return _select_in_view(sides, name_sides(sides), paths[0])
+
+
+def _check_can_be_compared(sides: Sequence[Side], path: Path) -> None:
+    """Check that there are at least two sides; `path` is the first sweep.
+
+    Raises:
+        InputError: there is only one.
+    """
     if len(sides) < 2:
         raise InputError(
             "compared: expected a sweep of several models, or several sweeps, got "
-            f"{paths[0]}, a sweep of one model; "
+            f"{path}, a sweep of one model; "
             "name another sweep of the same draws beside it, or give `model` two "
             "models when you sweep"
         )
-    for side in sides[1:]:
-        check_same_draws(sides[0], side)
+
+
+def _select_in_view(
+    sides: Sequence[Side], names: Sequence[str], path: Path
+) -> list[Side]:
+    """Return named sides without the images in which the object is out of view.
+
+    An image is left out of all sides if the object is out of view in any of them.
+
+    Args:
+        sides: sides with the same images, in the same order.
+        names: name of each side.
+        path: run directory of the first sweep, for the message.
+
+    Raises:
+        InputError: no image has the object in all sides.
+    """
     in_view = np.logical_and.reduce([rules.is_in_view(side.rows) for side in sides])
-    names = name_sides(sides)
     if not in_view.any():
         raise InputError(
-            "compared: expected pictures with the object in them, got "
-            f"none in {paths[0]}"
+            f"compared: expected pictures with the object in them, got none in {path}"
         )
     return [
         replace(side, name=name, rows=side.rows[in_view].reset_index(drop=True))
@@ -132,14 +157,7 @@ def name_sides(sides: Sequence[Side]) -> list[str]:
     if that is not enough, a number.
     """
     columns = _find_different_columns(sides)
-    names = []
-    for side in sides:
-        # The label is empty for the clean scene, which has no adversarial run.
-        labels = [
-            wording.shorten_names(side.name_by_column[column]) or "as it is"
-            for column in columns
-        ]
-        names.append(", ".join(labels))
+    names = [_join_labels(side, columns) for side in sides]
     if len(set(names)) < len(names):
         # All names are empty if the sides differ in no column.
         folders = [side.sweep.folder.name for side in sides]
@@ -150,6 +168,16 @@ def name_sides(sides: Sequence[Side]) -> list[str]:
     if len(set(names)) < len(names):
         names = [f"{number}: {name}" for number, name in enumerate(names, start=1)]
     return names
+
+
+def _join_labels(side: Side, columns: Sequence[str]) -> str:
+    """Return the values of columns of a side, separated by commas."""
+    # The label is empty for the clean scene, which has no adversarial run.
+    labels = [
+        wording.shorten_names(side.name_by_column[column]) or "as it is"
+        for column in columns
+    ]
+    return ", ".join(labels)
 
 
 def _find_different_columns(sides: Sequence[Side]) -> list[str]:
@@ -181,26 +209,51 @@ def read_sweep_sides(path: Path, *, is_only_sweep: bool) -> Iterator[Side]:
     model_index = rows["step"] % len(models)
     rows["number"] = rows["step"] // len(models)
     rows["correct"] = rows["correct"] == 1
-    # A mask selects the rows of one scene. Without an attack it selects all rows.
-    scene_masks = [rows["number"] >= 0]
-    if sweep.config.adversarial_of:
-        # The second half of the images are of the adversarial scene.
-        n_images = sweep.summary.planned // len(models)
-        is_adversarial = rows["number"] >= n_images // 2
-        scene_masks = [is_adversarial]
-        if is_only_sweep:
-            scene_masks = [~is_adversarial, is_adversarial]
-    for is_of_scene in scene_masks:
+    for is_of_scene in _make_scene_masks(sweep, rows, is_only_sweep):
         for index, model in enumerate(models):
             is_of_side = is_of_scene & (model_index == index)
             side_rows = rows[is_of_side].reset_index(drop=True)
-            labels = {"object": sweep.summary.object, "model": model, "answer": ""}
-            # Rows have one of these columns only if it has several values. The values
-            # are joined, since an object may vary within one side.
-            for column in SIDE_COLUMNS:
-                if column in side_rows:
-                    labels[column] = ",".join(side_rows[column].unique())
+            labels = _label_rows(side_rows, sweep.summary.object, model)
             yield Side(name="", sweep=sweep, name_by_column=labels, rows=side_rows)
+
+
+def _make_scene_masks(
+    sweep: workbench.StoredSweep, rows: pd.DataFrame, is_only_sweep: bool
+) -> list[pd.Series]:
+    """Return the masks of the rows of each scene: the clean one and the adversarial one.
+
+    Without an adversarial scene there is one mask, which selects all rows.
+
+    Args:
+        sweep: the sweep.
+        rows: its rows, with the `number` of each image.
+        is_only_sweep: whether no other sweep is compared; else the clean scene is left
+            out.
+    """
+    if not sweep.config.adversarial_of:
+        return [rows["number"] >= 0]
+    # The second half of the images are of the adversarial scene.
+    n_images = sweep.summary.planned // len(sweep.config.models)
+    is_adversarial = rows["number"] >= n_images // 2
+    return [~is_adversarial, is_adversarial] if is_only_sweep else [is_adversarial]
+
+
+def _label_rows(rows: pd.DataFrame, object_names: str, model: str) -> dict[str, str]:
+    """Return the object, the model and the adversarial scene of rows, by column.
+
+    Rows have one of these columns only if it has several values. The values are joined,
+    since an object may vary within one side.
+
+    Args:
+        rows: the rows.
+        object_names: object of the sweep.
+        model: model of the rows.
+    """
+    labels = {"object": object_names, "model": model, "answer": ""}
+    for column in SIDE_COLUMNS:
+        if column in rows:
+            labels[column] = ",".join(rows[column].unique())
+    return labels
 
 
 def _read_finished_sweep(path: Path) -> tuple[workbench.StoredSweep, pd.DataFrame]:
@@ -218,12 +271,26 @@ def _read_finished_sweep(path: Path) -> tuple[workbench.StoredSweep, pd.DataFram
             f"predictions; go on with it: advsearch resume {path}"
         )
     rows = sweep.read_rows()
-    if len(rows) != summary.planned or not rows["step"].is_unique:
+    _check_complete(path, rows, summary.planned)
+    return sweep, rows
+
+
+def _check_complete(path: Path, rows: pd.DataFrame, n_planned: int) -> None:
+    """Check that a sweep has all of its rows, each once.
+
+    Args:
+        path: the run directory of the sweep, for the message.
+        rows: its rows.
+        n_planned: number of rows that its summary states.
+
+    Raises:
+        FileFormatError: it has more or fewer, or a row twice.
+    """
+    if len(rows) != n_planned or not rows["step"].is_unique:
         raise errors.FileFormatError(
-            f"{path}: expected {summary.planned} rows, as its summary says, got "
+            f"{path}: expected {n_planned} rows, as its summary says, got "
             f"{len(rows)}; sweep again"
         )
-    return sweep, rows
 
 
 def check_same_draws(first: Side, second: Side) -> None:
@@ -238,6 +305,28 @@ def check_same_draws(first: Side, second: Side) -> None:
     if first.sweep.folder == second.sweep.folder:
         return
     where = f"{first.sweep.folder} and {second.sweep.folder}"
+    _check_same_draw_settings(first, second, where)
+    if len(first.rows) != len(second.rows):
+        raise InputError(
+            f"compared: expected sweeps with as many pictures, got {len(first.rows)} "
+            f"and {len(second.rows)} in "
+            f"{where}; sweep as many objects and environments in both"
+        )
+    if first.name_by_column["object"] != second.name_by_column["object"]:
+        return  # the values may differ, as default ranges may follow from the object
+    _check_same_sampled_values(first, second, where)
+
+
+def _check_same_draw_settings(first: Side, second: Side, where: str) -> None:
+    """Check that two sides have the same settings of the sampling.
+
+    Args:
+        first, second: the sides.
+        where: the directories of their sweeps, for the message.
+
+    Raises:
+        InputError: a setting differs.
+    """
     first_settings = first.sweep.config.get_deciding_settings()
     second_settings = second.sweep.config.get_deciding_settings()
     for name in DRAW_SETTINGS:
@@ -247,14 +336,18 @@ def check_same_draws(first: Side, second: Side) -> None:
                 f"`{name}` differ; sweep one of them "
                 "again with the settings of the other"
             )
-    if len(first.rows) != len(second.rows):
-        raise InputError(
-            f"compared: expected sweeps with as many pictures, got {len(first.rows)} "
-            f"and {len(second.rows)} in "
-            f"{where}; sweep as many objects and environments in both"
-        )
-    if first.name_by_column["object"] != second.name_by_column["object"]:
-        return  # the values may differ, as default ranges may follow from the object
+
+
+def _check_same_sampled_values(first: Side, second: Side, where: str) -> None:
+    """Check that the sampled parameters that two sides both have are equal.
+
+    Args:
+        first, second: the sides.
+        where: the directories of their sweeps, for the message.
+
+    Raises:
+        InputError: a parameter has other values.
+    """
     # The keys of "units" are the names of the parameters.
     for name in first.rows.attrs["units"]:
         # names of what is compared, or of scenes, and no sampled values

@@ -111,44 +111,74 @@ def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
     from advsearch.questions.explain import findings
     from advsearch.questions.explain.renders import SweepRunner
 
-    config = context.config
-    progress = context.progress
-    progress.stage("reading rows")
-    sweeps = _read_sweeps(config)
+    context.progress.stage("reading rows")
+    sweeps = _read_sweeps(context.config)
     rows, table = read_table(sweeps)
-
-    found_rules, importance, envelope = _analyze_rows(table, config, progress)
-
+    found_rules, importance, envelope = _analyze_rows(
+        table, context.config, context.progress
+    )
     renders = SweepRunner(context, sweeps, rows, table)
-    rule_rows = _confirm_rules(renders, found_rules)
-    pairs = list(renders.find_pairs(found_rules.accepted))
-    clusters = renders.find_clusters()
+    rendered_fields = _render_findings(renders, found_rules)
     if renders.interrupted:
         context.ending = results.INTERRUPTED
     return context.result(
         ExplainResult,
-        sweeps=[str(sweep.folder) for sweep in sweeps],
-        object=settings.join_names(sweep.summary.object for sweep in sweeps),
-        model=settings.join_names(sweep.summary.model for sweep in sweeps),
-        environment=settings.join_names(sweep.summary.environment for sweep in sweeps),
-        controls=sweeps[0].summary.controls,
-        parameters=list(table.attrs["units"]),
-        # the counts of all rows: right, total, interval, share and outcomes
-        **vars(findings.count_right(table)),
-        # the number of draws, if several rows share a draw; else None
-        units=None if table["unit"].is_unique else table["unit"].nunique(),
-        rules=rule_rows,
+        **_join_sweep_names(sweeps),
+        **_count_rows(table),
+        **rendered_fields,
         rejected_rule=findings.make_rejected_rule(
             found_rules.best_rejected, len(table)
         ),
         importance=importance,
         envelope=envelope,
-        pairs=pairs,
-        pairs_sought=renders.pairs_sought,
-        clusters=clusters,
-        renders=renders.n_renders,
         warnings=[*renders.warnings, *findings.find_row_warnings(table, importance)],
     )
+
+
+def _join_sweep_names(sweeps: Sequence[workbench.StoredSweep]) -> dict[str, Any]:
+    """Return the fields of the result that name the sweeps and what they rendered."""
+    return {
+        "sweeps": [str(sweep.folder) for sweep in sweeps],
+        "object": settings.join_names(sweep.summary.object for sweep in sweeps),
+        "model": settings.join_names(sweep.summary.model for sweep in sweeps),
+        "environment": settings.join_names(
+            sweep.summary.environment for sweep in sweeps
+        ),
+        "controls": sweeps[0].summary.controls,
+    }
+
+
+def _count_rows(table: pd.DataFrame) -> dict[str, Any]:
+    """Return the fields of the result about all rows: parameters, counts and draws."""
+    # heavy, and the help of the command line reads this module
+    from advsearch.questions.explain import findings
+
+    return {
+        "parameters": list(table.attrs["units"]),
+        # the counts of all rows: right, total, interval, share and outcomes
+        **vars(findings.count_right(table)),
+        # the number of draws, if several rows share a draw; else None
+        "units": None if table["unit"].is_unique else table["unit"].nunique(),
+    }
+
+
+def _render_findings(renders: Any, found_rules: Any) -> dict[str, Any]:
+    """Render what tests the findings, and return the fields of the result about that.
+
+    Args:
+        renders: renders configurations, until it is interrupted.
+        found_rules: the rules that were found.
+    """
+    rule_rows = _confirm_rules(renders, found_rules)
+    pairs = list(renders.find_pairs(found_rules.accepted))
+    clusters = renders.find_clusters()
+    return {
+        "rules": rule_rows,
+        "pairs": pairs,
+        "pairs_sought": renders.pairs_sought,
+        "clusters": clusters,
+        "renders": renders.n_renders,
+    }
 
 
 def _read_sweeps(config: ExplainConfig) -> list[workbench.StoredSweep]:
@@ -224,17 +254,26 @@ def read_table(
 
     rows = read_predictions(sweeps)
     rows = rows[rules.is_in_view(rows)].reset_index(drop=True)
-    if len(rows) < rules.MIN_ROWS:
-        raise InputError(
-            f"explain: expected at least {rules.MIN_ROWS} rows, got {len(rows)}; sweep "
-            "more configurations"
-        )
+    _check_row_count(rows, rules.MIN_ROWS)
     table = rules.make_table(rows, rows.attrs["units"])
     if not table.attrs["units"]:
         raise InputError(
             "explain: expected a parameter that varies and that all rows have, got none"
         )
     return rows, table
+
+
+def _check_row_count(rows: pd.DataFrame, n_needed: int) -> None:
+    """Check that there are enough rows.
+
+    Raises:
+        InputError: there are fewer.
+    """
+    if len(rows) < n_needed:
+        raise InputError(
+            f"explain: expected at least {n_needed} rows, got {len(rows)}; sweep "
+            "more configurations"
+        )
 
 
 def find_sweeps(path: Path) -> list[Path]:

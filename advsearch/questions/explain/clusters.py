@@ -64,17 +64,29 @@ def find_clusters(features: FloatArray, seed: int) -> Clusters:
     points = decomposition.PCA(n_components, random_state=0).fit_transform(directions)
 
     silhouette, cluster_of_point = cluster_points(points)
+    members = _list_members(points, cluster_of_point)
+    if len(members) < 2:
+        return Clusters(members, silhouette=None, are_separated=False)
+    are_separated = _is_clearer_than_noise(seed, points, silhouette)
+    return Clusters(members, silhouette, are_separated)
+
+
+def _list_members(
+    points: FloatArray, cluster_of_point: IntArray
+) -> tuple[tuple[int, ...], ...]:
+    """Return the points of each cluster, the most central first; the largest is first.
+
+    Args:
+        points: (n, d).
+        cluster_of_point: index of the cluster of each point (n,).
+    """
     n_clusters = int(cluster_of_point.max()) + 1
-    # the points of each cluster, the most central first
     members = [
         sort_by_distance(points, np.flatnonzero(cluster_of_point == index))
         for index in range(n_clusters)
     ]
     members.sort(key=len, reverse=True)
-    if n_clusters < 2:
-        return Clusters(tuple(members), silhouette=None, are_separated=False)
-    are_separated = _is_clearer_than_noise(seed, points, silhouette)
-    return Clusters(tuple(members), silhouette, are_separated)
+    return tuple(members)
 
 
 def _is_clearer_than_noise(seed: int, points: FloatArray, silhouette: float) -> bool:

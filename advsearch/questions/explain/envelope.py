@@ -49,18 +49,9 @@ def find_envelope(
     """
     if selection_rows.empty:
         return None
-    # The box is chosen for its accuracy among the selection rows, which therefore is
-    # too large on average: a reserve is added to the required accuracy. Near 1 it is
-    # half of the distance to 1.
-    required = min(accuracy + ACCURACY_RESERVE, (1.0 + accuracy) / 2.0)
-    box: rules.RuleConditions = ()  # without conditions: everything
-    inside = selection_rows
-    while rules.estimate_interval(inside)[0] < required:  # the lower bound
-        smaller_box = find_best_peel(box, inside, selection_rows)
-        if smaller_box is None:
-            return None
-        box = smaller_box
-        inside = selection_rows[rules.find_covered(box, selection_rows)]
+    box = _peel_until(_add_reserve(accuracy), selection_rows)
+    if box is None:
+        return None
     counts = count_right(test_rows[rules.find_covered(box, test_rows)])
     conditions = [condition.row for condition in box]  # as a result stores them
     lower_bound = counts.interval[0]
@@ -70,6 +61,36 @@ def find_envelope(
         accuracy=accuracy,
         confirmed=lower_bound >= accuracy,
     )
+
+
+def _add_reserve(accuracy: float) -> float:
+    """Return the accuracy that a box has to have among the selection rows.
+
+    The box is chosen for its accuracy among these rows, which therefore is too large on
+    average: a reserve is added to the required accuracy. Near 1 it is half of the
+    distance to 1.
+    """
+    return min(accuracy + ACCURACY_RESERVE, (1.0 + accuracy) / 2.0)
+
+
+def _peel_until(
+    required: float, selection_rows: pd.DataFrame
+) -> rules.RuleConditions | None:
+    """Peel a box until the lower bound of its accuracy is large enough; None if it never is.
+
+    Args:
+        required: required lower bound.
+        selection_rows: rows by which the box is chosen.
+    """
+    box: rules.RuleConditions = ()  # without conditions: everything
+    inside = selection_rows
+    while rules.estimate_interval(inside)[0] < required:  # the lower bound
+        smaller_box = find_best_peel(box, inside, selection_rows)
+        if smaller_box is None:
+            return None
+        box = smaller_box
+        inside = selection_rows[rules.find_covered(box, selection_rows)]
+    return box
 
 
 def find_best_peel(
@@ -118,11 +139,8 @@ def list_peels(
             if smaller != condition and not is_empty:
                 conditions = {**condition_of_factor, factor: smaller}
                 # in the order of the factors, and not in that of the peels
-                yield tuple(
-                    conditions[name]
-                    for name in inside.attrs["units"]
-                    if name in conditions
-                )
+                factors = [name for name in inside.attrs["units"] if name in conditions]
+                yield tuple(conditions[name] for name in factors)
 
 
 def list_factor_peels(

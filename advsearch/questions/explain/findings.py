@@ -89,18 +89,7 @@ def find_row_warnings(
         table: the rows, with the columns `correct` and `unit` (the draw).
         importance: weights of the factors.
     """
-    warnings = []
-    n_draws = table["unit"].nunique()
-    if n_draws == 1:
-        warnings.append(
-            "The rows are of one draw: a single drive, or images that differ only in "
-            "noise. The fractions are those of this draw, and say nothing about others."
-        )
-    elif n_draws < rules.MIN_ROWS:
-        warnings.append(
-            f"The rows are of {n_draws} draws. Rows of the same draw are not "
-            "independent, and so few draws show little."
-        )
+    warnings = _find_draw_warnings(table["unit"].nunique())
     if table["correct"].nunique() < 2:
         always = "right" if table["correct"].all() else "wrong"
         warnings.append(
@@ -112,3 +101,18 @@ def find_row_warnings(
             "all fractions begin at 0."
         )
     return warnings
+
+
+def _find_draw_warnings(n_draws: int) -> list[str]:
+    """Return a warning if rows are of so few draws that they show little."""
+    if n_draws == 1:
+        return [
+            "The rows are of one draw: a single drive, or images that differ only in "
+            "noise. The fractions are those of this draw, and say nothing about others."
+        ]
+    if n_draws < rules.MIN_ROWS:
+        return [
+            f"The rows are of {n_draws} draws. Rows of the same draw are not "
+            "independent, and so few draws show little."
+        ]
+    return []

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import math
 from itertools import combinations
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -104,15 +104,12 @@ def _find_interacting_pairs(
     }
     pairs = list(combinations(group_of_factor, 2))
     pair_weights = []
-    for factor_a, factor_b in pairs:
-        group_a = group_of_factor[factor_a]
-        group_b = group_of_factor[factor_b]
+    for factors in pairs:
+        group_a, group_b = (group_of_factor[factor] for factor in factors)
         joint_group = cross_groups(group_a, group_b)
         p_value = sample.interaction_p_value(joint_group, group_a, group_b)
         if p_value < SIGNIFICANCE / len(pairs):
-            pair_weights.append(
-                sample.estimate_weight([factor_a, factor_b], joint_group)
-            )
+            pair_weights.append(sample.estimate_weight([*factors], joint_group))
     return pair_weights
 
 
@@ -149,6 +146,34 @@ def cross_groups(first: IntArray, second: IntArray) -> IntArray:
     Two rows are in the same joint group if they are in the same group by both factors.
     """
     return first * (int(second.max()) + 1) + second
+
+
+class _Correction(NamedTuple):
+    """A fraction of the variance without what chance adds, and how it is distributed.
+
+    Attributes:
+        fraction: the corrected fraction.
+        design_effect: by how much clusters make the statistic larger; 1 without them.
+        error_degrees: degrees of freedom of F's denominator; infinity for chi-squared.
+    """
+
+    fraction: float
+    design_effect: float
+    error_degrees: float
+
+
+class _Cells(NamedTuple):
+    """What groups and clusters of predictions have in common.
+
+    Attributes:
+        index: the cell of each prediction (n,).
+        group: the group of each cell (cells,).
+        cluster: the cluster of each cell (cells,).
+    """
+
+    index: IntArray
+    group: IntArray
+    cluster: IntArray
 
 
 class ClusteredPredictions:
@@ -215,11 +240,6 @@ class ClusteredPredictions:
         not known, or if there is a single group, the fraction is 0 and its interval 0
         to 1: nothing is known.
 
-        The interval follows from the statistic rows * fraction / design effect. It has
-        a noncentral chi-squared distribution (with clusters, a noncentral F, multiplied
-        by the degrees of freedom). Its noncentrality is rows * true fraction / design
-        effect: an interval of the noncentrality gives one of the true fraction.
-
         Args:
             factors: names of the factors.
             group: (n,) the group of each prediction, by the values of the factors.
@@ -232,32 +252,59 @@ class ClusteredPredictions:
                 parameters=factors, share=0.0, interval=(0.0, 1.0), parts=n_groups
             )
 
-        n_rows = len(self.correct)
-        degrees = n_groups - 1
-        if self.is_independent:
-            design_effect = 1.0
-            error_degrees = math.inf
-            # adjusted R squared: 1 - (1 - R²) (n - 1) / (n - k)
-            residual_degrees = max(n_rows - n_groups, 1)
-            corrected_fraction = (
-                1.0 - (1.0 - fraction) * (n_rows - 1) / residual_degrees
-            )
-        else:
-            # Independent rows have `degrees` as their expected statistic.
-            design_effect = chance_statistic / degrees
-            error_degrees = float(self.n_clusters - n_groups)
-            corrected_fraction = fraction - chance_statistic / n_rows
+        correction = self._correct_fraction(fraction, n_groups, chance_statistic)
+        return ParameterWeight(
+            parameters=factors,
+            share=max(correction.fraction, 0.0),
+            interval=self._estimate_fraction_interval(fraction, n_groups, correction),
+            parts=n_groups,
+        )
 
+    def _estimate_fraction_interval(
+        self, fraction: float, n_groups: int, correction: _Correction
+    ) -> tuple[float, float]:
+        """Return the 95 % interval of a fraction of the variance between groups.
+
+        It follows from the statistic rows * fraction / design effect. That has a
+        noncentral chi-squared distribution (with clusters, a noncentral F, multiplied
+        by the degrees of freedom). Its noncentrality is rows * true fraction / design
+        effect: an interval of the noncentrality gives one of the true fraction.
+
+        Args:
+            fraction: the explained fraction, before the correction.
+            n_groups: number of groups.
+            correction: its design effect and its degrees of freedom are used.
+        """
+        n_rows = len(self.correct)
+        design_effect = correction.design_effect
         lower_noncentrality, upper_noncentrality = noncentrality_interval(
-            n_rows * fraction / design_effect, degrees, error_degrees
+            n_rows * fraction / design_effect, n_groups - 1, correction.error_degrees
         )
         lower = min(design_effect * lower_noncentrality / n_rows, 1.0)
         upper = min(design_effect * upper_noncentrality / n_rows, 1.0)
-        return ParameterWeight(
-            parameters=factors,
-            share=max(corrected_fraction, 0.0),
-            interval=(lower, upper),
-            parts=n_groups,
+        return lower, upper
+
+    def _correct_fraction(
+        self, fraction: float, n_groups: int, chance_statistic: float
+    ) -> _Correction:
+        """Subtract from a fraction of the variance what chance adds on average.
+
+        Args:
+            fraction: the explained fraction.
+            n_groups: number of groups.
+            chance_statistic: expected statistic of a factor without any effect.
+        """
+        n_rows = len(self.correct)
+        if self.is_independent:
+            # adjusted R squared: 1 - (1 - R²) (n - 1) / (n - k)
+            residual_degrees = max(n_rows - n_groups, 1)
+            corrected = 1.0 - (1.0 - fraction) * (n_rows - 1) / residual_degrees
+            return _Correction(corrected, design_effect=1.0, error_degrees=math.inf)
+        return _Correction(
+            fraction - chance_statistic / n_rows,
+            # Independent rows have `n_groups - 1` as their expected statistic.
+            design_effect=chance_statistic / (n_groups - 1),
+            error_degrees=float(self.n_clusters - n_groups),
         )
 
     def expected_statistic(self, group: IntArray) -> float:
@@ -269,11 +316,8 @@ class ClusteredPredictions:
         1). With clusters, it is (groups - 1) times the design effect (Rao and Scott
         1981, section 3).
 
-        With clusters, the sum over groups has this expectation: the sum over groups of
-        weight * variance of the group's rate, minus rows * variance of the overall
-        rate. Both variances are estimated from the residuals of clusters. The result is
-        at least `MIN_INFLATION` times (groups - 1). It is NaN if a group has fewer than
-        two clusters.
+        The result is at least `MIN_INFLATION` times (groups - 1). It is NaN if a group
+        has fewer than two clusters.
 
         Args:
             group: (n,) the group of each prediction.
@@ -284,34 +328,68 @@ class ClusteredPredictions:
         if self.is_independent:
             return float(n_groups - 1)
 
-        # A cell is what a cluster and a group have in common; `cell` (n,) is the index
-        # of the cell of each prediction.
-        cell_id, cell = np.unique(
+        cells = self._divide_into_cells(group)
+        clusters_per_group = np.bincount(cells.group, minlength=len(group_weight))
+        if not self._has_enough_clusters(n_groups, clusters_per_group[is_used]):
+            return math.nan
+        excess = self._estimate_excess(group, group_weight, cells, clusters_per_group)
+        return max(excess, MIN_INFLATION * float(n_groups - 1))
+
+    def _divide_into_cells(self, group: IntArray) -> _Cells:
+        """Return the cells of predictions, by their groups (n,) and their clusters."""
+        cell_id, index = np.unique(
             group * self.n_clusters + self.cluster, return_inverse=True
         )
-        cell_group, cell_cluster = np.divmod(cell_id, self.n_clusters)  # (cells,) each
-        clusters_per_group = np.bincount(cell_group, minlength=len(group_weight))
-        # The variance inside a group needs two clusters there, and that of the overall
-        # rate more clusters than groups.
-        has_enough_clusters = self.n_clusters >= 2 and self.n_clusters > n_groups
-        if not has_enough_clusters or clusters_per_group[is_used].min() < 2:
-            return math.nan
+        cell_group, cell_cluster = np.divmod(cell_id, self.n_clusters)
+        return _Cells(index.reshape(-1), cell_group, cell_cluster)
 
+    def _estimate_excess(
+        self,
+        group: IntArray,
+        group_weight: npt.NDArray[Any],
+        cells: _Cells,
+        clusters_per_group: IntArray,
+    ) -> float:
+        """Estimate the expected statistic of a factor without effect from clusters.
+
+        It is the sum over groups of weight * variance of the group's rate, minus rows *
+        variance of the overall rate, divided by the variance of a prediction. The
+        variances of the rates are estimated from the residuals of clusters.
+
+        Args:
+            group: (n,) the group of each prediction.
+            group_weight: (groups,) sum of the weights; 0 for a group that is not used.
+            cells: cells of the groups and the clusters.
+            clusters_per_group: (groups,) number of clusters of each group.
+        """
+        is_used = group_weight > 0
         residual = self._weighted_residual(group, group_weight, is_used)
-        cell_residual = np.bincount(cell.reshape(-1), residual)
+        cell_residual = np.bincount(cells.index, residual)
+        # (groups,) sum over the cells of each group
         squared_residual = np.bincount(
-            cell_group, cell_residual**2, minlength=len(group_weight)
+            cells.group, cell_residual**2, minlength=len(group_weight)
         )
         within_groups = within_group_variance(
             squared_residual[is_used],
             clusters_per_group[is_used],
             group_weight[is_used],
         )
-        between_clusters = self._between_cluster_variance(cell_cluster, cell_residual)
-        return max(
-            (within_groups - between_clusters) / self.variance,
-            MIN_INFLATION * float(n_groups - 1),
-        )
+        between_clusters = self._between_cluster_variance(cells.cluster, cell_residual)
+        return float((within_groups - between_clusters) / self.variance)
+
+    def _has_enough_clusters(self, n_groups: int, clusters_per_group: IntArray) -> bool:
+        """Return whether the variances of rates can be estimated from clusters.
+
+        That inside a group needs two clusters there, and that of the overall rate more
+        clusters than groups.
+
+        Args:
+            n_groups: number of groups.
+            clusters_per_group: (groups,) number of clusters of each group.
+        """
+        if self.n_clusters < 2 or self.n_clusters <= n_groups:
+            return False
+        return bool(clusters_per_group.min() >= 2)
 
     def _weighted_residual(
         self,
@@ -364,10 +442,10 @@ class ClusteredPredictions:
         The statistic of a grouping is the number of rows times its explained fraction.
         Without an interaction, the statistic of both factors together is the sum of the
         statistics of each. The excess over this sum is the test statistic. If rows are
-        independent, its distribution is chi-squared. Its degrees of freedom are (cells
-        - 1) - (first groups - 1) - (second groups - 1), where a cell is a group of
-        both factors. With clusters it is divided by its expectation, and its
-        distribution is F. The p-value is 1 if there are too few clusters.
+        independent, its distribution is chi-squared. The degrees of freedom follow from
+        the numbers of groups; a group of both factors is called a cell. With clusters
+        the statistic is divided by its expectation, and its distribution is F. The
+        p-value is 1 if there are too few clusters.
 
         Args:
             joint_group: (n,) the group of each prediction by both factors.
@@ -379,19 +457,30 @@ class ClusteredPredictions:
         second_fraction, n_second = self.explained_fraction(second_group)
         excess_fraction = joint_fraction - first_fraction - second_fraction
         statistic = len(self.correct) * excess_fraction
+        # (cells - 1) - (first groups - 1) - (second groups - 1)
         degrees = max(1, n_cells - n_first - n_second + 1)
         if self.is_independent:
             return float(chi2.sf(statistic, degrees))
 
-        expected = self.expected_statistic(joint_group)
-        expected -= self.expected_statistic(first_group)
-        expected -= self.expected_statistic(second_group)
+        expected = self._expected_excess(joint_group, first_group, second_group)
         error_degrees = self.n_clusters - degrees - 1
         # `expected_statistic` is NaN if it is not known: then this is False.
         is_known = expected > 0.0
         if not is_known or error_degrees < 1:
             return 1.0
         return float(f_distribution.sf(statistic / expected, degrees, error_degrees))
+
+    def _expected_excess(
+        self, joint_group: IntArray, first_group: IntArray, second_group: IntArray
+    ) -> float:
+        """Return the expected statistic of an interaction without effect.
+
+        NaN if it is not known. The arguments are those of `interaction_p_value`.
+        """
+        expected = self.expected_statistic(joint_group)
+        expected -= self.expected_statistic(first_group)
+        expected -= self.expected_statistic(second_group)
+        return expected
 
 
 def within_group_variance(
@@ -459,18 +548,10 @@ def find_noncentrality(
 
     def excess_probability(noncentrality: float) -> float:
         """Return P(value <= statistic) - `probability`, which falls to below 0."""
-        is_central = noncentrality <= 0.0
-        if math.isinf(error_degrees):
-            distribution = chi2(degrees) if is_central else ncx2(degrees, noncentrality)
-            cumulative = distribution.cdf(statistic)
-        else:
-            central = f_distribution(degrees, error_degrees)
-            distribution = (
-                central if is_central else ncf(degrees, error_degrees, noncentrality)
-            )
-            cumulative = distribution.cdf(statistic / degrees)  # one of F
-        # scipy returns NaN for a noncentrality that is too large: P is then about 0.
-        return float(np.nan_to_num(cumulative)) - probability
+        cumulative = _compute_cumulative_probability(
+            statistic, degrees, error_degrees, noncentrality
+        )
+        return cumulative - probability
 
     if excess_probability(0.0) <= 0.0:
         return 0.0
@@ -478,3 +559,29 @@ def find_noncentrality(
     while excess_probability(upper_bound) > 0.0:
         upper_bound *= 2.0
     return float(brentq(excess_probability, 0.0, upper_bound, xtol=1e-6))
+
+
+def _compute_cumulative_probability(
+    statistic: float, degrees: int, error_degrees: float, noncentrality: float
+) -> float:
+    """Return the probability of a value up to a statistic.
+
+    Args:
+        statistic: statistic of a noncentral chi-squared distribution, or `degrees`
+            times one of F.
+        degrees: degrees of freedom.
+        error_degrees: degrees of freedom of F's denominator; infinity for chi-squared.
+        noncentrality: noncentrality of the distribution; 0 for a central one.
+    """
+    is_central = noncentrality <= 0.0
+    if math.isinf(error_degrees):
+        distribution = chi2(degrees) if is_central else ncx2(degrees, noncentrality)
+        cumulative = distribution.cdf(statistic)
+    else:
+        central = f_distribution(degrees, error_degrees)
+        distribution = (
+            central if is_central else ncf(degrees, error_degrees, noncentrality)
+        )
+        cumulative = distribution.cdf(statistic / degrees)  # one of F
+    # scipy returns NaN for a noncentrality that is too large: P is then about 0.
+    return float(np.nan_to_num(cumulative))

@@ -110,18 +110,34 @@ class SweepRunner:
         try:
             self.context.run_part(name, config)
         except InputError as error:
-            # The same error, such as a missing scene, is reported only once.
-            if str(error) not in self._errors:
-                self._errors.add(str(error))
-                self.warnings.append(f"Nothing was rendered for {name}: {error}")
+            self._warn_about_sweep(name, error)
             return None
-        sweep = workbench.StoredSweep.read(
-            RunDirectory.locate_part(self.context.run.path, name)
-        )
+        sweep = self._read_finished_part(name)
+        return None if self.interrupted else read_predictions([sweep])
+
+    def _read_finished_part(self, name: str) -> workbench.StoredSweep:
+        """Read a sweep that has ended, and count its renders.
+
+        `interrupted` is set if it ended by Ctrl-C.
+
+        Args:
+            name: name of the run in the directory of this experiment.
+        """
+        path = RunDirectory.locate_part(self.context.run.path, name)
+        sweep = workbench.StoredSweep.read(path)
         self._rendered[name] = sweep
         self.interrupted = sweep.summary.is_unfinished
         self.n_renders += sum(sweep.summary.renders.values())
-        return None if self.interrupted else read_predictions([sweep])
+        return sweep
+
+    def _warn_about_sweep(self, name: str, error: InputError) -> None:
+        """Add a warning that a sweep could not be rendered.
+
+        The same error, such as a missing scene, is reported only once.
+        """
+        if str(error) not in self._errors:
+            self._errors.add(str(error))
+            self.warnings.append(f"Nothing was rendered for {name}: {error}")
 
     # ---- rules
     # ------------------------------------------------------------------------------
@@ -145,17 +161,7 @@ class SweepRunner:
             return None
         rule = counted_rules[index]
         earlier_conditions = [earlier.conditions for earlier in counted_rules[:index]]
-        covered_rows = self.factor_table[
-            rules.find_covered(rule.conditions, self.factor_table)
-        ]
-        # Fresh rows that earlier rules cover are left out afterwards. The smaller the
-        # fraction of the others, the more configurations are rendered.
-        is_uncovered = find_uncovered(earlier_conditions, covered_rows)
-        # at least `MIN_UNCOVERED_FRACTION`, which limits the number of renders
-        uncovered_fraction = max(float(is_uncovered.mean()), MIN_UNCOVERED_FRACTION)
-        fresh_frames = self._render_inside(
-            index, rule, uncovered_fraction, earlier_conditions
-        )
+        fresh_frames = self._render_inside(index, rule, earlier_conditions)
         fresh_rows = pd.concat(fresh_frames) if fresh_frames else self.rows[:0]
         if fresh_rows.empty:
             return None
@@ -166,11 +172,29 @@ class SweepRunner:
         fresh_rule = rules.CountedRule(rule.conditions, fresh_rows, elsewhere)
         return Confirmation(**vars(count_right(fresh_rows)), confirmed=fresh_rule.holds)
 
+    def _estimate_uncovered_fraction(
+        self,
+        conditions: rules.RuleConditions,
+        earlier_conditions: Sequence[rules.RuleConditions],
+    ) -> float:
+        """Return the fraction of a rule's rows that no earlier rule covers.
+
+        At least `MIN_UNCOVERED_FRACTION`, which limits the number of renders.
+
+        Args:
+            conditions: conditions of the rule.
+            earlier_conditions: conditions of the rules before it.
+        """
+        covered_rows = self.factor_table[
+            rules.find_covered(conditions, self.factor_table)
+        ]
+        is_uncovered = find_uncovered(earlier_conditions, covered_rows)
+        return max(float(is_uncovered.mean()), MIN_UNCOVERED_FRACTION)
+
     def _render_inside(
         self,
         index: int,
         rule: rules.CountedRule,
-        uncovered_fraction: float,
         earlier_conditions: Sequence[rules.RuleConditions],
     ) -> list[pd.DataFrame]:
         """Render fresh configurations inside a rule in the scene of each sweep.
@@ -181,13 +205,17 @@ class SweepRunner:
         Args:
             index: index of the rule.
             rule: the rule.
-            uncovered_fraction: fraction of its rows that no earlier rule covers.
             earlier_conditions: conditions of the rules before it.
 
         Returns:
             The rows of each sweep. Their draws (column `unit`) have texts as names,
             which are distinct from those of other sweeps.
         """
+        # Fresh rows that earlier rules cover are left out afterwards. The smaller the
+        # fraction of the others, the more configurations are rendered.
+        uncovered_fraction = self._estimate_uncovered_fraction(
+            rule.conditions, earlier_conditions
+        )
         fresh_frames = []
         for sweep_index, sweep in enumerate(self.sweeps):
             n_arcs = count_arcs(sweep.config, rule.conditions)
@@ -197,31 +225,51 @@ class SweepRunner:
                 self.config.confirm / len(self.sweeps) / n_arcs / uncovered_fraction
             )
             for arc in range(n_arcs):
-                self.progress.message(
-                    f"rule {index + 1}: rendering about {samples} "
-                    "configurations inside it"
-                )
-                # a number that is distinct for each rule, sweep and arc
-                number = (index * len(self.sweeps) + sweep_index) * MAX_ARCS + arc
-                config = make_sweep_inside(
-                    sweep.config,
-                    self.factor_table,
-                    rule.conditions,
-                    samples,
-                    seed=seeds.derive_seed(self.config.seed, "confirm", number),
-                    arc=arc,
-                )
-                suffix = f"-{arc}" if arc else ""
-                rows = self.run_sweep(f"rule-{index + 1}-{sweep_index}{suffix}", config)
+                rows = self._render_arc(index, rule, sweep_index, arc, samples)
                 # None after an interrupt, or if nothing could be rendered
-                if rows is None:
-                    continue
-                inside = select_inside(rows, rule.conditions, earlier_conditions)
-                # Draws of other sweeps may have the same indices: with this number
-                # their names differ, such as "12 of 3".
-                unit = inside["unit"].astype(str) + f" of {number}"
-                fresh_frames.append(inside.assign(unit=unit))
+                if rows is not None:
+                    inside = select_inside(rows, rule.conditions, earlier_conditions)
+                    number = self._number_sweep(index, sweep_index, arc)
+                    fresh_frames.append(_name_fresh_draws(inside, number))
         return fresh_frames
+
+    def _number_sweep(self, index: int, sweep_index: int, arc: int) -> int:
+        """Return a number that is distinct for each rule, sweep and arc."""
+        return (index * len(self.sweeps) + sweep_index) * MAX_ARCS + arc
+
+    def _render_arc(
+        self,
+        index: int,
+        rule: rules.CountedRule,
+        sweep_index: int,
+        arc: int,
+        samples: int,
+    ) -> pd.DataFrame | None:
+        """Render configurations inside a rule in the scene of a sweep; return the rows.
+
+        None after an interrupt, or if nothing could be rendered.
+
+        Args:
+            index: index of the rule.
+            rule: the rule.
+            sweep_index: index of the sweep.
+            arc: index of the arc of conditions on angles.
+            samples: number of configurations.
+        """
+        self.progress.message(
+            f"rule {index + 1}: rendering about {samples} configurations inside it"
+        )
+        number = self._number_sweep(index, sweep_index, arc)
+        config = make_sweep_inside(
+            self.sweeps[sweep_index].config,
+            self.factor_table,
+            rule.conditions,
+            samples,
+            seed=seeds.derive_seed(self.config.seed, "confirm", number),
+            arc=arc,
+        )
+        suffix = f"-{arc}" if arc else ""
+        return self.run_sweep(f"rule-{index + 1}-{sweep_index}{suffix}", config)
 
     # ---- pairs
     # ------------------------------------------------------------------------------
@@ -231,11 +279,7 @@ class SweepRunner:
     ) -> Iterator[NearestRight]:
         """Yield for typical failures the nearest configuration that is predicted right.
 
-        That configuration differs from the failure in one parameter. First all
-        parameters of the failure's rule are tried, and the one with the smallest
-        relative change is used. If none of these makes the prediction right, the other
-        parameters are tried one by one, and the first one that does is used. If none
-        does, the failure has no pair.
+        A failure may have no such configuration.
 
         Args:
             counted_rules: all rules, in their order.
@@ -244,23 +288,44 @@ class SweepRunner:
             self.factor_table, counted_rules, self.config.pairs
         )
         for number, (index, conditions) in enumerate(failures, start=1):
-            rule_factors = [condition.factor for condition in conditions]
-            other_factors = [
-                factor
-                for factor in self.factor_table.attrs["units"]
-                if factor not in rule_factors
+            pair = self._find_pair(f"pair-{number}", index, conditions)
+            if pair is not None:
+                yield pair
+
+    def _find_pair(
+        self, name: str, index: int, conditions: rules.RuleConditions
+    ) -> NearestRight | None:
+        """Return the nearest configuration to a failure that is predicted right.
+
+        That configuration differs from the failure in one parameter. First all
+        parameters of the failure's rule are tried, and the one with the smallest
+        relative change is used. If none of these makes the prediction right, the other
+        parameters are tried one by one, and the first one that does is used. If none
+        does, the failure has no pair.
+
+        Args:
+            name: name of the pair, such as "pair-3".
+            index: index of the failure among the rows.
+            conditions: conditions of the failure's rule.
+        """
+        for factors in self._group_factors(conditions):
+            attempts = [
+                self._find_nearest_right(name, index, factor) for factor in factors
             ]
-            # groups to try: all factors of the rule, then each other factor by itself
-            factor_groups = [rule_factors, *([factor] for factor in other_factors)]
-            for factors in factor_groups:
-                attempts = [
-                    self._find_nearest_right(f"pair-{number}", index, factor)
-                    for factor in factors
-                ]
-                pairs = [pair for pair in attempts if pair is not None]
-                if pairs:
-                    yield min(pairs, key=self._relative_change)
-                    break
+            pairs = [pair for pair in attempts if pair is not None]
+            if pairs:
+                return min(pairs, key=self._relative_change)
+        return None
+
+    def _group_factors(self, conditions: rules.RuleConditions) -> list[list[str]]:
+        """Return all factors of a rule as one group, then each other factor by itself."""
+        rule_factors = [condition.factor for condition in conditions]
+        other_factors = [
+            factor
+            for factor in self.factor_table.attrs["units"]
+            if factor not in rule_factors
+        ]
+        return [rule_factors, *([factor] for factor in other_factors)]
 
     def _relative_change(self, pair: NearestRight) -> float:
         """Return the difference of a pair as a fraction of the factor's range.
@@ -302,9 +367,56 @@ class SweepRunner:
             return None
         self._tried_failures.add(index)  # counted in `pairs_sought`
 
-        frame_a, frame_b = frames  # the same configurations, with different noise
-        wrong_value = failure[factor]
-        values = frame_a[factor].tolist()  # the failure's own value is among them
+        rows = self._find_pair_rows(frames, factor, failure[factor])
+        if rows is None:
+            return None
+        # images of the first of both renders
+        pictures = self._list_thumbnails(f"{run_name}-0", rows)
+        return self._make_nearest_right(frames[0], rows, failure, factor, pictures)
+
+    def _make_nearest_right(
+        self,
+        frame: pd.DataFrame,
+        rows: tuple[int, int],
+        failure: dict[str, float | str],
+        factor: str,
+        pictures: list[str],
+    ) -> NearestRight:
+        """Describe a failure and the nearest configuration that is predicted right.
+
+        Args:
+            frame: rows of configurations along the factor.
+            rows: indices of the failure and of the other configuration.
+            failure: values of the failure by parameter.
+            factor: the parameter that varies.
+            pictures: files of both images.
+        """
+        failure_row, nearest_row = rows
+        return NearestRight(
+            values=failure,
+            parameter=factor,
+            unit=self.factor_table.attrs["units"][factor],
+            wrong_at=failure[factor],
+            right_at=frame[factor].tolist()[nearest_row],
+            failure_label=frame["label"][failure_row],
+            right_label=frame["label"][nearest_row],
+            pictures=pictures,
+        )
+
+    def _find_pair_rows(
+        self, frames: Sequence[pd.DataFrame], factor: str, wrong_value: float | str
+    ) -> tuple[int, int] | None:
+        """Return the indices of a failure and of the nearest right value along a factor.
+
+        None if there is no such value, or if the failure is predicted right once.
+
+        Args:
+            frames: rows of the same configurations along the factor, with different noise.
+            factor: the parameter that varies.
+            wrong_value: the failure's own value, which is among them.
+        """
+        frame_a, frame_b = frames
+        values = frame_a[factor].tolist()
         failure_row = values.index(wrong_value)
         is_right_in_both = np.asarray(frame_a["correct"] & frame_b["correct"])
         is_right_in_any = np.asarray(frame_a["correct"] | frame_b["correct"])
@@ -313,17 +425,7 @@ class SweepRunner:
         nearest_row = self._find_nearest_value(
             factor, is_right_in_both, values, wrong_value
         )
-        return NearestRight(
-            values=failure,
-            parameter=factor,
-            unit=self.factor_table.attrs["units"][factor],
-            wrong_at=wrong_value,
-            right_at=values[nearest_row],
-            failure_label=frame_a["label"][failure_row],
-            right_label=frame_a["label"][nearest_row],
-            # images of the first of both renders
-            pictures=self._list_thumbnails(f"{run_name}-0", (failure_row, nearest_row)),
-        )
+        return failure_row, nearest_row
 
     def _render_twice(
         self,
@@ -417,6 +519,18 @@ class SweepRunner:
         if rendered is None:
             return None
         images, compute_features = rendered
+        return self._cluster_failures(sampled, images, compute_features)
+
+    def _cluster_failures(
+        self, sampled: pd.DataFrame, images: torch.Tensor, compute_features: Any
+    ) -> FailureClusters:
+        """Cluster rendered failures by the features of the model.
+
+        Args:
+            sampled: their rows.
+            images: their images (n, H, W, 3).
+            compute_features: function from images to features.
+        """
         clusters = find_clusters(
             compute_features(images).double().numpy(), self.config.seed
         )
@@ -464,10 +578,7 @@ class SweepRunner:
             self.interrupted = True
             return None
         self.n_renders += len(sampled)
-        images = torch.cat([batch_images for batch_images, _ in batches])
-        # All batches have the same function, since there is one model.
-        _, compute_features = batches[0]
-        return images, compute_features
+        return _join_batches(batches)
 
     def _warn_about_selection(self, selected: Sequence[int]) -> None:
         """Add a warning if not all sweeps have failures of the clustered model.
@@ -550,6 +661,27 @@ class SweepRunner:
         return torch.stack(images), compute_features
 
 
+def _join_batches(
+    batches: Sequence[tuple[torch.Tensor, Any]],
+) -> tuple[torch.Tensor, Any]:
+    """Return the images (n, H, W, 3) of all batches, and the function of the features.
+
+    All batches have the same function, since there is one model.
+    """
+    images = torch.cat([batch_images for batch_images, _ in batches])
+    _, compute_features = batches[0]
+    return images, compute_features
+
+
+def _name_fresh_draws(rows: pd.DataFrame, number: int) -> pd.DataFrame:
+    """Return rows of a sweep with names of their draws, such as "12 of 3".
+
+    Draws of other sweeps may have the same indices: with the sweep's number their names
+    differ.
+    """
+    return rows.assign(unit=rows["unit"].astype(str) + f" of {number}")
+
+
 def count_arcs(config: SweepConfig, conditions: rules.RuleConditions) -> int:
     """Return the number of sweeps that cover the arcs of conditions on angles.
 
@@ -609,26 +741,39 @@ def find_typical_failures(
         counted_rules: the rules.
         limit: maximum number of failures that are returned.
     """
+    failures = []
+    # the most typical failure of each group, then the second one of each, and so on
+    for failures_of_groups in zip_longest(*_group_failures(table, counted_rules)):
+        # `zip_longest` yields None for a group that has no more failures.
+        failures += [failure for failure in failures_of_groups if failure is not None]
+    return failures[:limit]
+
+
+def _group_failures(
+    table: pd.DataFrame, counted_rules: Sequence[rules.CountedRule]
+) -> list[list[tuple[int, rules.RuleConditions]]]:
+    """Return the failures of each rule that no earlier rule covers, then the others.
+
+    In each group the failures nearest to its mean come first.
+
+    Args:
+        table: the rows.
+        counted_rules: the rules.
+    """
     ranks = _rank_rows(table)  # (n, parameters)
     is_unassigned: rules.Mask = ~table["correct"].to_numpy()
     no_conditions: rules.RuleConditions = ()  # these cover every row
     group_conditions = [*(rule.conditions for rule in counted_rules), no_conditions]
-    groups = []  # lists of failures, the most typical first
+    groups = []
     for conditions in group_conditions:
         is_in_group = is_unassigned & rules.find_covered(conditions, table)
         indices = np.flatnonzero(is_in_group)
         is_unassigned[indices] = False
         if not len(indices):
             continue
-        # the failures nearest to the mean of their group first
         order = _sort_by_distance_from_mean(ranks[indices])
         groups.append([(index, conditions) for index in indices[order].tolist()])
-    failures = []
-    # the most typical failure of each group, then the second one of each, and so on
-    for failures_of_groups in zip_longest(*groups):
-        # `zip_longest` yields None for a group that has no more failures.
-        failures += [failure for failure in failures_of_groups if failure is not None]
-    return failures[:limit]
+    return groups
 
 
 def _sort_by_distance_from_mean(ranks: rules.FloatArray) -> npt.NDArray[np.intp]:

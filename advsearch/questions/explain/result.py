@@ -254,14 +254,8 @@ def make_explain_view(result: ExplainResult) -> ShownResult:
     Its sections are the rules, the weights of the parameters, the box in which the
     model can be relied on, pairs of a failure and a right image, and kinds of failures.
     """
-    rule_sentences = [
-        f"{number}. {describe_rule_row(number, rule)}"
-        for number, rule in enumerate(result.rules, start=1)
-    ]
-    rule_sentences.append(describe_rejected_rule(result))  # "" if there is none
-    note = RULES_NOTE if result.rules else ""
     sections = [
-        ResultPart("Rules", rule_sentences, note=note),
+        _make_rules_part(result),
         ResultPart.make_table(
             result.importance[:MAX_WEIGHTS],
             WEIGHT_COLUMNS,
@@ -269,22 +263,43 @@ def make_explain_view(result: ExplainResult) -> ShownResult:
             note=IMPORTANCE_NOTE,
         ),
         ResultPart("Where it can be relied on", [describe_envelope(result)]),
+        *_make_failure_parts(result),
     ]
-    if result.pairs_sought:  # the number of failures for which a pair was looked for
-        sections.append(ResultPart("One thing changed", [describe_pairs(result)]))
-    sections += [_pair_section(pair) for pair in result.pairs]
-    if result.clusters:
-        sections.append(_cluster_section(result.clusters))
+    about = [result.object, result.model]
+    return ShownResult(_make_headline(result), sections, _list_row_facts(result), about)
+
+
+def _list_row_facts(result: ExplainResult) -> dict[str, str]:
+    """Return the rows, the sweeps and the parameters, by what they are."""
     # None if each row is an independent draw
     draws = f", of {result.units:,} independent draws" if result.units else ""
-    facts = {
+    return {
         # for example "right in 88 % (84 to 91) of 340, of 20 independent draws"
         "rows": f"right in {result.text}{draws}",
         "sweeps": ", ".join(result.sweeps),
         "parameters": ", ".join(result.parameters),
     }
-    about = [result.object, result.model]
-    return ShownResult(_make_headline(result), sections, facts, about)
+
+
+def _make_rules_part(result: ExplainResult) -> ResultPart:
+    """Return the part with all rules in sentences, and the best one that was rejected."""
+    rule_sentences = [
+        f"{number}. {describe_rule_row(number, rule)}"
+        for number, rule in enumerate(result.rules, start=1)
+    ]
+    rule_sentences.append(describe_rejected_rule(result))  # "" if there is none
+    note = RULES_NOTE if result.rules else ""
+    return ResultPart("Rules", rule_sentences, note=note)
+
+
+def _make_failure_parts(result: ExplainResult) -> Iterator[ResultPart]:
+    """Yield the parts about single failures: pairs with a right image, and kinds."""
+    if result.pairs_sought:  # the number of failures for which a pair was looked for
+        yield ResultPart("One thing changed", [describe_pairs(result)])
+    for pair in result.pairs:
+        yield _pair_section(pair)
+    if result.clusters:
+        yield _cluster_section(result.clusters)
 
 
 def _make_headline(result: ExplainResult) -> str:
@@ -367,14 +382,22 @@ def describe_rejected_rule(result: ExplainResult) -> str:
         f"{rule.total} under it and in {rule.elsewhere.right} of "
         f"{rule.elsewhere.total} elsewhere"
     )
+    return text + _describe_missing_significance(rule)
+
+
+def _describe_missing_significance(rule: RejectedRule) -> str:
+    """Describe how many rows a rule would need to be significant.
+
+    The text continues a sentence.
+    """
     if rule.rows is None:
-        return f"{text}. More rows would not make this difference significant."
+        return ". More rows would not make this difference significant."
     chance = (
         f"its p-value is {rule.chance:.2g}, and a significant rule has at most "
         f"{rule.p_value_limit:g}"
     )
     return (
-        f"{text}; {chance}. About {rule.rows:,} rows with these fractions would make "
+        f"; {chance}. About {rule.rows:,} rows with these fractions would make "
         "it significant: sweep more."
     )
 
@@ -416,27 +439,32 @@ def _cluster_section(clusters: FailureClusters) -> ResultPart:
     Kinds are clusters of failures. It states how many clusters there are, and has the
     most typical image of each.
     """
-    failures = f"the {clusters.failures} failures that were rendered again"
-    # `features` describes where they come from: "the input of head (Linear)"
-    text = f"One kind: {failures} are alike by {clusters.features}."
-    has_multiple_clusters = clusters.silhouette is not None  # one cluster has none
-    if has_multiple_clusters:
-        reservation = ""
-        if not clusters.are_separated:
-            reservation = (
-                "; the kinds merge into each other: random points without clusters may "
-                "be separated as well"
-            )
-        text = (
-            f"{len(clusters.listed)} kinds among {failures}, by {clusters.features} "
-            f"(silhouette {clusters.silhouette:.2f}{reservation})."
-        )
     pictures = []
     for cluster in clusters.listed:
         common_labels = list(cluster.labels.items())[:MAX_LABELS]
         labels = ", ".join(f"{label} {count}" for label, count in common_labels)
         pictures.append(views.Picture(cluster.picture, f"{cluster.failures}: {labels}"))
+    text = _describe_clusters(clusters)
     return ResultPart("Kinds of failures", [text], pictures=[pictures])
+
+
+def _describe_clusters(clusters: FailureClusters) -> str:
+    """Describe in a sentence how many kinds of failures there are."""
+    failures = f"the {clusters.failures} failures that were rendered again"
+    has_multiple_clusters = clusters.silhouette is not None  # one cluster has none
+    if not has_multiple_clusters:
+        # `features` describes where they come from: "the input of head (Linear)"
+        return f"One kind: {failures} are alike by {clusters.features}."
+    reservation = ""
+    if not clusters.are_separated:
+        reservation = (
+            "; the kinds merge into each other: random points without clusters may "
+            "be separated as well"
+        )
+    return (
+        f"{len(clusters.listed)} kinds among {failures}, by {clusters.features} "
+        f"(silhouette {clusters.silhouette:.2f}{reservation})."
+    )
 
 
 def make_explain_claims(result: ExplainResult) -> Iterator[views.Claim]:

@@ -6,7 +6,7 @@ parameters; in a sweep of drives, all frames of a drive are rows of the same dra
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import pandas as pd
@@ -36,33 +36,48 @@ def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
         `attrs["units"]` maps each parameter, or scene setting, to its unit of
         measurement.
     """
-    frames = []
-    for index, sweep in enumerate(sweeps):
-        rows = sweep.read_rows()
-        for name in SCENE_SETTINGS:
-            if name in rows:
-                full_names = rows[name].astype(object)
-            else:  # rows have no such column if the setting is the same in all of them
-                full_names = pd.Series(getattr(sweep.summary, name), rows.index)
-            rows[name] = full_names.map(wording.format_figure_value)
-        rows["draw"] = name_draws(sweep, rows)
-        rows["image"] = name_images(sweep, rows)
-        frames.append(rows.assign(sweep=index))
-
+    frames = [_read_sweep_frame(index, sweep) for index, sweep in enumerate(sweeps)]
     table = pd.concat(frames, ignore_index=True)
     is_repeated = table.duplicated("image")
     table = table[~is_repeated].reset_index(drop=True)
     units = _collect_units(frames)
-    for name in units:
-        has_names = not pd.api.types.is_float_dtype(table[name])
-        if has_names:
-            table[name] = table[name].astype("category")
+    _make_names_categories(table, units)
     _, draw_indices = np.unique(table["draw"], return_inverse=True)
     table["unit"] = draw_indices
     table = table.drop(columns=["draw", "image"])
     table["correct"] = (table["correct"] == 1) & rules.is_in_view(table)
     table.attrs["units"] = units
     return table
+
+
+def _make_names_categories(table: pd.DataFrame, columns: Iterable[str]) -> None:
+    """Convert the columns that have names, and not numbers, to categories, in place."""
+    for name in columns:
+        has_names = not pd.api.types.is_float_dtype(table[name])
+        if has_names:
+            table[name] = table[name].astype("category")
+
+
+def _read_sweep_frame(index: int, sweep: workbench.StoredSweep) -> pd.DataFrame:
+    """Read the rows of a sweep with columns for its scene.
+
+    The columns "draw" and "image" have the names of the draw and of the image, and
+    "sweep" the index of the sweep.
+
+    Args:
+        index: index of the sweep.
+        sweep: the sweep.
+    """
+    rows = sweep.read_rows()
+    for name in SCENE_SETTINGS:
+        if name in rows:
+            full_names = rows[name].astype(object)
+        else:  # rows have no such column if the setting is the same in all of them
+            full_names = pd.Series(getattr(sweep.summary, name), rows.index)
+        rows[name] = full_names.map(wording.format_figure_value)
+    rows["draw"] = name_draws(sweep, rows)
+    rows["image"] = name_images(sweep, rows)
+    return rows.assign(sweep=index)
 
 
 def _collect_units(frames: Sequence[pd.DataFrame]) -> dict[str, str]:

@@ -16,6 +16,14 @@ import pandas as pd
 from advsearch.extend import Parameter, SweepConfig, rules, settings, wording
 from advsearch.questions.explain.rows import SCENE_SETTINGS
 
+# Workers and machines of a cluster take longer to start than ten images to render.
+SETTINGS_ALONG: dict[str, Any] = {
+    "samples": None,
+    "keep_pictures": "all",
+    "workers": None,
+    "cluster": None,
+}
+"""Settings of a sweep along one factor."""
 N_VALUES_ALONG = 9
 """Number of values of a factor that are tried to find the nearest right prediction."""
 
@@ -52,16 +60,9 @@ def make_sweep_inside(
         name: sorted(inside[name].unique().tolist()) for name in table.attrs["units"]
     }
     scene_settings = cut_scene_settings(config, values_inside)
-    n_scenes = math.prod(
-        len(settings.split_names(names)) if names else 1
-        for names in scene_settings.values()
-    )
-    # An axis that does not vary in the rows keeps its values.
-    full_grid = {
-        name: values_inside.get(name, values) for name, values in config.grid.items()
-    }
+    n_scenes = _count_scenes_of_settings(scene_settings)
     # twice the number of samples, for all scenes together
-    grid = thin_grid(full_grid, max_points=2 * samples / n_scenes)
+    grid = cut_grid(config, values_inside, max_points=2 * samples / n_scenes)
     n_configurations = count_grid_points(grid) * n_scenes
     controls = cut_controls(config, table, conditions, arc)
     # number of draws at each point of the grid in each scene; None if nothing is
@@ -70,6 +71,32 @@ def make_sweep_inside(
     return make_minimal_config(
         config, grid=grid, controls=controls, samples=draws, seed=seed, **scene_settings
     )
+
+
+def _count_scenes_of_settings(scene_settings: Mapping[str, str | None]) -> int:
+    """Return the number of combinations of objects, environments and models."""
+    return math.prod(
+        len(settings.split_names(names)) if names else 1
+        for names in scene_settings.values()
+    )
+
+
+def cut_grid(
+    config: SweepConfig, values_inside: Mapping[str, Sequence[Any]], max_points: float
+) -> dict[str, Any]:
+    """Return the grid of a sweep, reduced to values under conditions and thinned.
+
+    An axis that does not vary in the rows keeps its values.
+
+    Args:
+        config: settings of the sweep.
+        values_inside: values that each factor has under the conditions.
+        max_points: largest number of points of the grid.
+    """
+    full_grid = {
+        name: values_inside.get(name, values) for name, values in config.grid.items()
+    }
+    return thin_grid(full_grid, max_points)
 
 
 def thin_grid(grid: Mapping[str, Any], max_points: float) -> dict[str, Any]:
@@ -233,36 +260,49 @@ def make_sweep_along(
         seed: seed of the noise.
     """
     values = list_values_along(table[factor], row[factor])
-    # Parameters, which have a dot in their name, are axes of the grid.
-    grid: dict[str, object] = {
-        name: [row[name]] for name in row if "." in name and is_settable(config, name)
-    }
-    # Object, environment and model are settings.
+    # Object, environment and model are settings; other parameters are axes of the grid.
     scene_settings = _find_scene_settings(config, row)
+    grid = _make_point_grid(config, row)
     if factor in SCENE_SETTINGS:
-        scene_settings[factor] = ",".join(
-            name for value in values for name in find_names(config, factor, str(value))
-        )
+        scene_settings[factor] = _join_matching_names(config, factor, values)
     else:
         grid[factor] = values
-    # A parameter must not be set and be an axis at the same time.
-    set_values = {
-        name: value for name, value in config.set_.items() if name not in grid
-    }
     return make_minimal_config(
         config,
         grid=grid,
         controls=select_choices(config, grid),
-        samples=None,
         seed=seed,
-        keep_pictures="all",
-        set=set_values,
-        # Workers and machines of a cluster take longer to start than ten images to
-        # render.
-        workers=None,
-        cluster=None,
+        set=_leave_out_axes(config, grid),
+        **SETTINGS_ALONG,
         **scene_settings,
     )
+
+
+def _leave_out_axes(config: SweepConfig, grid: Mapping[str, object]) -> dict[str, Any]:
+    """Return the parameters that a sweep sets, without the axes of a grid.
+
+    A parameter must not be set and be an axis at the same time.
+    """
+    return {name: value for name, value in config.set_.items() if name not in grid}
+
+
+def _make_point_grid(
+    config: SweepConfig, row: Mapping[str, float | str]
+) -> dict[str, object]:
+    """Return a grid of a single point: the parameters of a row, which have a dot."""
+    return {
+        name: [row[name]] for name in row if "." in name and is_settable(config, name)
+    }
+
+
+def _join_matching_names(
+    config: SweepConfig, setting: str, values: Sequence[float | str]
+) -> str:
+    """Return the names in a setting that rows write as values, separated by commas."""
+    names: list[str] = []
+    for value in values:
+        names += find_names(config, setting, str(value))
+    return ",".join(names)
 
 
 def _find_scene_settings(
@@ -320,13 +360,17 @@ def select_choices(
             for parameter in control_type.declare_parameters(options)
         ]
         if choices and all(name in grid for name in parameters):
-            # "kind" states the type of the control, if that is not its name.
-            controls[instance] = {
-                name: value
-                for name, value in options.items()
-                if name in {*choices, "kind"}
-            }
+            controls[instance] = _extract_choices(options, choices)
     return controls
+
+
+def _extract_choices(options: Mapping[str, Any], choices: set[str]) -> dict[str, Any]:
+    """Return the options of a control that are choices, and its "kind".
+
+    "kind" states the type of the control, if that is not its name.
+    """
+    used_names = {*choices, "kind"}
+    return {name: value for name, value in options.items() if name in used_names}
 
 
 def is_sampled(config: SweepConfig, factor: str) -> bool:

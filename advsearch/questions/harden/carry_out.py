@@ -51,6 +51,7 @@ from advsearch.questions.harden.scenes import (
     ROBUST,
     TRAINING,
     VALIDATION,
+    Job,
     SceneJobs,
 )
 from advsearch.questions.harden.training import ClassifierTrainer, Examples
@@ -112,25 +113,49 @@ def run_hardening(
     workbench.check_run_settings(config)
     check_settings(config, beside, loss)
     original_model, warnings = load_task_model(config, model)
-    splits = scenes.make_splits(config, original_model)
-    work = SceneJobs(config, original_model, splits, context.progress)
+    work = _make_scene_jobs(context, original_model)
     trainer = make_trainer(work, optimiser, examples=beside, loss=loss)
-    # Only the arguments that the task uses are compared with those of an earlier
-    # session: `beside` is for classifiers, `loss` for the other tasks.
-    arguments: dict[str, Any] = {"optimiser": optimiser}
-    if config.task_name == "classification":
-        arguments["beside"] = beside
-    else:
-        arguments["loss"] = loss
+    arguments = _select_task_arguments(config, optimiser, beside, loss)
     check_same_arguments(context.run, arguments)
     workbench.check_digests(context.run, [original_model])
 
     hardening = Hardening(context.run, trainer)
+    _execute_with_workers(context, hardening)
+    return hardening.make_result(context, warnings)
+
+
+def _make_scene_jobs(context: RunContext[HardenConfig], model: Model) -> SceneJobs:
+    """Create what samples, renders and attacks the scenes of a run, for a model."""
+    splits = scenes.make_splits(context.config, model)
+    return SceneJobs(context.config, model, splits, context.progress)
+
+
+def _select_task_arguments(
+    config: HardenConfig,
+    optimiser: MakeOptimizer | None,
+    examples: Examples | None,
+    loss: Loss | None,
+) -> dict[str, Any]:
+    """Return the Python arguments that the task uses, by their public names.
+
+    Only these are compared with those of an earlier session: `beside` is for
+    classifiers, `loss` for the other tasks.
+    """
+    if config.task_name == "classification":
+        return {"optimiser": optimiser, "beside": examples}
+    return {"optimiser": optimiser, "loss": loss}
+
+
+def _execute_with_workers(
+    context: RunContext[HardenConfig], hardening: Hardening
+) -> None:
+    """Execute a hardening until it ends or is interrupted, on workers if set."""
+    config = context.config
     worker = "advsearch.questions.harden.scenes:load_scene_work"
     with context.until_interrupted():
-        with workbench.open_executor(config, worker, context.progress) as work.executor:
+        with workbench.open_executor(config, worker, context.progress) as executor:
+            hardening.scene_jobs.executor = executor
             hardening.execute(context)
-    return hardening.make_result(context, warnings)
 
 
 def make_trainer(
@@ -171,15 +196,9 @@ def check_settings(
     Raises:
         InputError: a setting or an argument belongs to another task.
     """
-    task_name = config.task_name
-    is_classifier = task_name == "classification"
-    uses_data_or_loss = bool(config.data or loss)
-    if task_name not in TRAINERS or (is_classifier and uses_data_or_loss):
-        raise InputError(
-            "task: harden trains for classification, detection and segmentation; "
-            "`data` is for detection only, and `loss` not for classification"
-        )
-    if task_name == "segmentation" and config.data:
+    _check_trained_task(config, loss)
+    is_classifier = config.task_name == "classification"
+    if config.task_name == "segmentation" and config.data:
         raise InputError("data: is for detection only; leave it out")
     if not is_classifier and beside is not None:
         raise InputError(
@@ -188,6 +207,21 @@ def check_settings(
     if not is_classifier and config.layers != "all":
         raise InputError(
             "layers: expected `all` for a detector or a segmenter; leave it out"
+        )
+
+
+def _check_trained_task(config: HardenConfig, loss: Loss | None) -> None:
+    """Check that there is a trainer for the task, and no argument it cannot use.
+
+    Raises:
+        InputError: there is none, or a classifier has images of detection or a loss.
+    """
+    is_classifier = config.task_name == "classification"
+    uses_data_or_loss = bool(config.data or loss)
+    if config.task_name not in TRAINERS or (is_classifier and uses_data_or_loss):
+        raise InputError(
+            "task: harden trains for classification, detection and segmentation; "
+            "`data` is for detection only, and `loss` not for classification"
         )
 
 
@@ -268,15 +302,17 @@ class Hardening:
         }
         self.clean_is_right: dict[str, list[bool]] = {}
         self.outcomes: dict[str, dict[str, int]] = {}
+        self.n_scenes = self._count_scenes()
+
+    def _count_scenes(self) -> dict[str, int]:
+        """Return the number of scenes of each split."""
         n_training = self.config.scenes * self.config.rounds
-        n_attacked = self.config.measured
-        # Plain images are cheaper than attacks, so they are evaluated in more scenes.
-        n_held_out = scenes.CLEAN_SCENES * n_attacked
-        self.n_scenes = {
+        return {
             TRAINING: n_training,
-            FURTHER: trainer.n_further_scenes * n_training,
+            FURTHER: self.trainer.n_further_scenes * n_training,
             VALIDATION: self.rounds.n_validation_scenes,
-            HELD_OUT: n_held_out,
+            # Plain images are cheaper than attacks, so they are evaluated in more scenes.
+            HELD_OUT: scenes.CLEAN_SCENES * self.config.measured,
         }
 
     def execute(self, context: RunContext[HardenConfig]) -> None:
@@ -293,23 +329,27 @@ class Hardening:
         # which saves a sixth of the time.
         gc.freeze()
         try:
-            context.stages.begin("measurement", MEASUREMENTS["before"].title)
-            self._measure("before", weights=None)
-            # The stronger search has several policies and more steps. It shows whether
-            # the model resists, or only has gradients that mislead the usual search.
-            self._measure("stronger_before", weights=None)
-
-            context.stages.begin("training", "training")
-            self.rounds.execute()
-            weights = (self.run.path / WEIGHTS_FILE).read_bytes()
-
-            context.stages.begin("measurement", MEASUREMENTS["after"].title)
-            self._measure("after", weights)
-            self._measure("stronger", weights)
-            self._evaluate_plain_images(weights)
+            self._measure_and_train(context)
         finally:
             context.stages.end()
             gc.unfreeze()
+
+    def _measure_and_train(self, context: RunContext[HardenConfig]) -> None:
+        """Measure the original model, train its copy, and measure the hardened model."""
+        context.stages.begin("measurement", MEASUREMENTS["before"].title)
+        self._measure("before", weights=None)
+        # The stronger search has several policies and more steps. It shows whether
+        # the model resists, or only has gradients that mislead the usual search.
+        self._measure("stronger_before", weights=None)
+
+        context.stages.begin("training", "training")
+        self.rounds.execute()
+        weights = (self.run.path / WEIGHTS_FILE).read_bytes()
+
+        context.stages.begin("measurement", MEASUREMENTS["after"].title)
+        self._measure("after", weights)
+        self._measure("stronger", weights)
+        self._evaluate_plain_images(weights)
 
     def _evaluate_plain_images(self, weights: bytes) -> None:
         """Evaluate the original and the hardened model on plain held-out images.
@@ -325,13 +365,24 @@ class Hardening:
         # without the indices of the jobs: the order of the scenes does not matter
         evaluations = [value for _, value in self.scene_jobs.run_jobs(title, jobs)]
         for when in ("before", "after"):
-            is_right = list[bool]()
-            outcome_counts = Counter[str]()
-            for evaluation in evaluations:
-                is_right += evaluation[when]
-                outcome_counts.update(evaluation.get(f"outcomes {when}", ()))
-            self.clean_is_right[when] = is_right
-            self.outcomes[when] = dict(outcome_counts)
+            self._store_plain_evaluations(when, evaluations)
+
+    def _store_plain_evaluations(
+        self, when: str, evaluations: Sequence[Mapping[str, Any]]
+    ) -> None:
+        """Set `clean_is_right` and `outcomes` of one of the two models.
+
+        Args:
+            when: "before" or "after".
+            evaluations: what `SceneJobs.evaluate_plain_images` has returned for each scene.
+        """
+        is_right = list[bool]()
+        outcome_counts = Counter[str]()
+        for evaluation in evaluations:
+            is_right += evaluation[when]
+            outcome_counts.update(evaluation.get(f"outcomes {when}", ()))
+        self.clean_is_right[when] = is_right
+        self.outcomes[when] = dict(outcome_counts)
 
     def _measure(self, name: str, weights: bytes | None) -> None:
         """Attack the model on the held-out scenes that are not measured yet.
@@ -342,26 +393,17 @@ class Hardening:
                 those that the model was loaded with.
         """
         measurement = MEASUREMENTS[name]
-        is_stronger = measurement.weaker_measurement is not None
-        steps_factor = scenes.STRONGER_STEPS_FACTOR if is_stronger else 1
+        steps_factor = 1
         if measurement.weaker_measurement is not None:
+            steps_factor = scenes.STRONGER_STEPS_FACTOR
             # The stronger search is not run where the weaker one has found a failure.
             self._record_weaker(name, measurement.weaker_measurement)
         to_attack = self._list_unmeasured(name)
-        jobs = [
-            partial(
-                SceneJobs.attack_held_out,
-                steps_factor=steps_factor,
-                weights=weights,
-                control=control,
-                number=number,
-            )
-            for control, number in to_attack
-        ]
-        hint = "`measured` and `steps` shorten it"
-        for index, status in self.scene_jobs.run_jobs(
-            measurement.title, jobs, hint=hint
-        ):
+        jobs = _make_attack_jobs(to_attack, steps_factor, weights)
+        statuses = self.scene_jobs.run_jobs(
+            measurement.title, jobs, hint="`measured` and `steps` shorten it"
+        )
+        for index, status in statuses:
             control, number = to_attack[index]
             self._record(name, control, number, is_wrong=status != ROBUST)
 
@@ -427,8 +469,7 @@ class Hardening:
                 self.is_wrong_by_search.get((f"{measurement} {control}", number))
                 for control in controls
             ]
-            is_unmeasured = None in is_wrong
-            if is_unmeasured:
+            if None in is_wrong:  # not measured yet
                 return None
             is_robust.append(not any(is_wrong))
         return is_robust
@@ -442,37 +483,50 @@ class Hardening:
         """
         config = self.config
         is_done = context.ending == "done"
-        is_unchanged = (
-            self.rounds.best_round_number == 0
-        )  # round 0 is the original network
-        if is_done and is_unchanged:
-            text = (
-                "No round kept the clean accuracy, so the weights are the model's own."
-            )
-            warnings = [*warnings, text]  # a new list, to leave the caller's as it is
-        before = self._find_robust("before", config.controls)
-        after = self._find_robust("after", config.controls)
-        training_split = self.scene_jobs.splits[TRAINING]
         return context.result(
             HardenResult,
-            **_compare_robustness(before, after),
+            **self._make_share_fields(),
             **self._list_files(is_done),
-            environment=",".join(training_split.environments),
-            objects=list(training_split.objects),
-            before=make_share(before),
-            after=make_share(after),
-            clean_before=self._make_clean_share("before"),
-            clean_after=self._make_clean_share("after"),
+            **self._make_training_fields(is_done),
             table=self._make_control_rows(),
-            split=self._make_split_rows(),
-            rounds=self._mark_best_round(is_done),
             search=f"{config.policy_name}, {config.steps} steps",
             stronger_search="portfolio of pgd with restarts, cmaes and random, "
             f"{scenes.STRONGER_STEPS_FACTOR * config.steps} steps",
             shared=self._describe_workers(),
-            warnings=warnings,
+            # a new list, to leave the caller's as it is
+            warnings=[*warnings, *self._find_training_warnings(is_done)],
             seconds=context.stages.seconds,
         )
+
+    def _make_share_fields(self) -> dict[str, Any]:
+        """Return the fields with fractions of robust scenes and of right plain images."""
+        before = self._find_robust("before", self.config.controls)
+        after = self._find_robust("after", self.config.controls)
+        return {
+            **_compare_robustness(before, after),
+            "before": make_share(before),
+            "after": make_share(after),
+            "clean_before": self._make_clean_share("before"),
+            "clean_after": self._make_clean_share("after"),
+        }
+
+    def _make_training_fields(self, is_done: bool) -> dict[str, Any]:
+        """Return the fields that state what the model was trained on, and its rounds."""
+        training_split = self.scene_jobs.splits[TRAINING]
+        return {
+            "environment": ",".join(training_split.environments),
+            "objects": list(training_split.objects),
+            "split": self._make_split_rows(),
+            "rounds": self._mark_best_round(is_done),
+        }
+
+    def _find_training_warnings(self, is_done: bool) -> list[str]:
+        """Return a warning if the run is done, and its weights are the original ones."""
+        # round 0 is the original network
+        is_unchanged = self.rounds.best_round_number == 0
+        if not (is_done and is_unchanged):
+            return []
+        return ["No round kept the clean accuracy, so the weights are the model's own."]
 
     def _mark_best_round(self, is_done: bool) -> list[TrainingRound]:
         """Return the rounds so far; once all are done, the best is marked."""
@@ -529,13 +583,7 @@ class Hardening:
 
     def _make_split_rows(self) -> dict[str, SplitSide]:
         """Describe the parts of the split: objects, environments, scenes and views."""
-        training_views, validation_views = self.trainer.n_views
-        n_views = {
-            TRAINING: training_views,
-            FURTHER: 1,  # a new scene teaches more than another view
-            VALIDATION: validation_views,
-            HELD_OUT: scenes.CLEAN_VIEWS,
-        }
+        n_views = self._count_views()
         return {
             name: SplitSide(
                 objects=list(split.objects),
@@ -544,6 +592,16 @@ class Hardening:
                 views=n_views[name],
             )
             for name, split in self.scene_jobs.splits.items()
+        }
+
+    def _count_views(self) -> dict[str, int]:
+        """Return the number of views of a scene of each split."""
+        training_views, validation_views = self.trainer.n_views
+        return {
+            TRAINING: training_views,
+            FURTHER: 1,  # a new scene teaches more than another view
+            VALIDATION: validation_views,
+            HELD_OUT: scenes.CLEAN_VIEWS,
         }
 
     def _make_hardened_name(self) -> str | None:
@@ -555,6 +613,28 @@ class Hardening:
         if can_be_loaded:
             return f"{network_name}@{self.run.path / WEIGHTS_FILE}"
         return None
+
+
+def _make_attack_jobs(
+    to_attack: Sequence[tuple[str, int]], steps_factor: int, weights: bytes | None
+) -> list[Job]:
+    """Return the jobs that attack held-out scenes.
+
+    Args:
+        to_attack: control and number of the scene of each attack.
+        steps_factor: multiple of the usual steps of a search.
+        weights: bytes of a safetensors file; None for the original weights.
+    """
+    return [
+        partial(
+            SceneJobs.attack_held_out,
+            steps_factor=steps_factor,
+            weights=weights,
+            control=control,
+            number=number,
+        )
+        for control, number in to_attack
+    ]
 
 
 def _compare_robustness(
@@ -594,16 +674,24 @@ def make_share(
     """
     if is_right is None:
         return None
-    right_views = [
-        sum(is_right[start : start + views]) for start in range(0, len(is_right), views)
-    ]
-    n_views = [views] * len(right_views)
-    # The views of a scene are one cluster: the interval is computed from the number of
-    # right views of each scene.
     return Share(
         accuracy=sum(is_right) / len(is_right),
-        interval=statistics.clustered.rate_interval(right_views, n_views),
+        interval=_compute_interval_over_scenes(is_right, views),
         right=sum(is_right),
         count=len(is_right),
         outcomes=dict(outcomes or {}) or None,
     )
+
+
+def _compute_interval_over_scenes(
+    is_right: Sequence[bool], views: int
+) -> tuple[float, float]:
+    """Return the interval of an accuracy, with the views of a scene as one cluster.
+
+    It is computed from the number of right views of each scene.
+    """
+    right_views = [
+        sum(is_right[start : start + views]) for start in range(0, len(is_right), views)
+    ]
+    n_views = [views] * len(right_views)
+    return statistics.clustered.rate_interval(right_views, n_views)

@@ -34,18 +34,25 @@ def vary_environment(
         radiance = radiance[:, ::-1]
     tint = np.exp(rng.normal(0.0, 0.1, 3)).astype(np.float32)
     radiance = radiance * tint
+    mean = float(radiance.mean()) + 1e-6  # not 0
     # A power above 1 raises the contrast, one below 1 lowers it. Radiance at the mean
     # stays the same.
-    mean = float(radiance.mean()) + 1e-6  # not 0
     power = np.float32(rng.uniform(0.8, 1.15))
     radiance = mean * (radiance / mean) ** power
     if rng.random() < 0.5:
-        height, width = radiance.shape[:2]
-        lobe = sample_lobe(height, width, rng)
-        radiance = radiance + mean * lobe[..., None].astype(np.float32)
+        radiance = radiance + mean * _sample_gray_light(radiance, rng)
     return replace(
         environment, radiance=np.ascontiguousarray(radiance, dtype=np.float32)
     )
+
+
+def _sample_gray_light(
+    radiance: npt.NDArray[np.float32], rng: np.random.Generator
+) -> npt.NDArray[np.float32]:
+    """Sample a broad light (H, W, 1) for an environment map (H, W, 3)."""
+    height, width = radiance.shape[:2]
+    lobe = sample_lobe(height, width, rng)
+    return lobe[..., None].astype(np.float32)
 
 
 def sample_lobe(

@@ -98,14 +98,7 @@ class Example(NamedTuple):
         truth: Any = problem.find_truth(
             problem.make_full_configuration(configuration, seed)
         )
-        # There is no box in segmentation, or if the object is out of view.
-        box = getattr(truth, "box", None)
-        boxes = torch.zeros(0, 4, dtype=torch.float32)
-        labels = torch.zeros(0, dtype=torch.int64)
-        if box:
-            boxes = torch.tensor([box], dtype=torch.float32)
-            # If several labels are right, training uses the first.
-            labels = torch.tensor([truth.labels[0]], dtype=torch.int64)
+        boxes, labels = _make_box_tensors(truth)
         return cls(
             image_uint8=color.to_uint8(problem.picture(configuration, seed, SPP)),
             boxes=boxes,
@@ -121,6 +114,20 @@ class Example(NamedTuple):
         with torch.no_grad():
             output = model(self.image_uint8[None] / 255.0)
             return bool(self.task.loss(output, self.truth)[0] <= 0.0)
+
+
+def _make_box_tensors(truth: Any) -> tuple[Tensor, Tensor]:
+    """Return the box (1, 4) of a ground truth, and its label (1,).
+
+    Both are empty in segmentation, or if the object is out of view.
+    """
+    box = getattr(truth, "box", None)
+    if not box:
+        empty_boxes = torch.zeros(0, 4, dtype=torch.float32)
+        return empty_boxes, torch.zeros(0, dtype=torch.int64)
+    boxes = torch.tensor([box], dtype=torch.float32)
+    # If several labels are right, training uses the first.
+    return boxes, torch.tensor([truth.labels[0]], dtype=torch.int64)
 
 
 def read_coco(directory: Path, model: Model) -> list[Example]:
@@ -144,30 +151,50 @@ def read_coco(directory: Path, model: Model) -> list[Example]:
     path = directory / "annotations.json"
     image_directory = (directory / "images").resolve()
     try:
-        coco: Any = stored_files.parse_json(
-            stored_files.read_text(path, "a COCO file", MAX_BYTES)
-        )
-        label_of_category = {
-            category["id"]: model.labels.index(str(category["name"]))
-            for category in coco["categories"]
-            if str(category["name"]) in model.labels
-        }
-        annotations_of_image = _group_annotations(coco, label_of_category)
-        if not label_of_category:
-            raise InputError(
-                f"data: {path}: none of its categories is a label of model {model.name}"
-            )
-        examples = []
-        for image in coco["images"]:
-            file = _locate_image(image_directory, str(image["file_name"]), path)
-            levels = _read_levels(file, image)
-            boxes, labels = _read_boxes(annotations_of_image, image, label_of_category)
-            examples.append(Example(image_uint8=levels, boxes=boxes, labels=labels))
-        return examples
+        return _read_coco_examples(path, image_directory, model)
     except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise errors.FileFormatError(
             f"{path}: expected COCO's JSON and a folder images/, got {str(error)[:120]}"
         ) from None
+
+
+def _read_coco_examples(
+    path: Path, image_directory: Path, model: Model
+) -> list[Example]:
+    """Read the images that a COCO file lists, with the boxes of the model's labels.
+
+    Errors of a malformed file are those of Python.
+
+    Args:
+        path: the COCO file.
+        image_directory: directory of the images, resolved.
+        model: model whose labels are used.
+    """
+    coco: Any = stored_files.parse_json(
+        stored_files.read_text(path, "a COCO file", MAX_BYTES)
+    )
+    label_of_category = _match_categories(coco, model)
+    annotations_of_image = _group_annotations(coco, label_of_category)
+    if not label_of_category:
+        raise InputError(
+            f"data: {path}: none of its categories is a label of model {model.name}"
+        )
+    examples = []
+    for image in coco["images"]:
+        file = _locate_image(image_directory, str(image["file_name"]), path)
+        image_uint8 = _read_levels(file, image)
+        boxes, labels = _read_boxes(annotations_of_image, image, label_of_category)
+        examples.append(Example(image_uint8=image_uint8, boxes=boxes, labels=labels))
+    return examples
+
+
+def _match_categories(coco: Any, model: Model) -> dict[Any, int]:
+    """Return the index of the model's label by COCO's category, for known labels."""
+    return {
+        category["id"]: model.labels.index(str(category["name"]))
+        for category in coco["categories"]
+        if str(category["name"]) in model.labels
+    }
 
 
 def _read_levels(file: Path, image: Mapping[str, Any]) -> Tensor:
@@ -268,17 +295,7 @@ def compute_network_loss(
     Raises:
         ModelError: the network returns no loss.
     """
-    # `advsearch` wraps networks of both libraries: `inner` is the original network.
-    inner: Any = getattr(network, "network", network)
-    is_wrapped = inner is not network
-    is_of_transformers = hasattr(inner, "config")
-    loss: Any = None
-    if is_of_transformers:
-        loss = inner(pixel_values=x, labels=_transformers_labels(x, targets)).loss
-    elif is_wrapped:  # a network of torchvision
-        loss = inner(list(x), list(targets))
-    elif _takes_targets(network):
-        loss = network(x, list(targets))
+    loss = _call_in_training(network, x, targets)
     if isinstance(loss, Mapping):
         # `sum` makes a scalar of each loss, which may have shape () or (1,).
         loss = torch.stack([part.sum() for part in loss.values()]).sum()
@@ -290,6 +307,27 @@ def compute_network_loss(
         )
     # The sum of a single element: a scalar, which `backward` needs.
     return loss.sum()
+
+
+def _call_in_training(network: nn.Module, x: Tensor, targets: Sequence[Target]) -> Any:
+    """Return what a network returns if it gets targets; None if it takes none.
+
+    Args:
+        network: network in training mode.
+        x: the network's input (N, 3, H, W).
+        targets: the ground truth of each image.
+    """
+    # `advsearch` wraps networks of both libraries: `inner` is the original network.
+    inner: Any = getattr(network, "network", network)
+    is_of_transformers = hasattr(inner, "config")
+    if is_of_transformers:
+        return inner(pixel_values=x, labels=_transformers_labels(x, targets)).loss
+    is_wrapped = inner is not network
+    if is_wrapped:  # a network of torchvision
+        return inner(list(x), list(targets))
+    if _takes_targets(network):
+        return network(x, list(targets))
+    return None
 
 
 def _takes_targets(network: nn.Module) -> bool:
@@ -364,23 +402,36 @@ class DetectorTrainer(Trainer):
             split: name of the split that the scenes belong to.
             scene_numbers: numbers of the scenes.
         """
-        scene_split = self.scene_jobs.splits[split]
         controls = tuple(self.config.controls)
         plain = list[Example]()
         worst = list[Example]()
         self.scene_jobs.progress.stage(title, len(scene_numbers) * len(controls))
         for number in scene_numbers:
-            name, scene = scene_split.load_scene(number)
-            for control in controls:
-                # The seed is derived from control and scene number, so that a run that
-                # continues, or one with other controls, samples the same.
-                seed = seeds.derive_seed(scene_split.seed, f"search {control}", number)
-                plain_image, worst_image = self._attack(scene, name, control, seed)
+            for plain_image, worst_image in self._attack_by_control(split, number):
                 plain.append(plain_image)
                 worst.append(worst_image)
-                self.scene_jobs.progress.advance(1)
             plain += self._render_further_views(split, number, controls[-1])
         return plain + worst
+
+    def _attack_by_control(
+        self, split: str, number: int
+    ) -> list[tuple[Example, Example]]:
+        """Attack a scene with each control; return a plain and the worst image of each.
+
+        Args:
+            split: name of the split that the scene belongs to.
+            number: number of the scene.
+        """
+        scene_split = self.scene_jobs.splits[split]
+        name, scene = scene_split.load_scene(number)
+        image_pairs = []
+        for control in self.config.controls:
+            # The seed is derived from control and scene number, so that a run that
+            # continues, or one with other controls, samples the same.
+            seed = seeds.derive_seed(scene_split.seed, f"search {control}", number)
+            image_pairs.append(self._attack(scene, name, control, seed))
+            self.scene_jobs.progress.advance(1)
+        return image_pairs
 
     def _render_further_views(
         self, split: str, number: int, control: str
@@ -398,7 +449,7 @@ class DetectorTrainer(Trainer):
         """
         scene_split = self.scene_jobs.splits[split]
         problem, _ = self.scene_jobs.make_problem(scene_split, number, (control,))
-        # the same seed as in `sample_items`
+        # the same seed as in `_attack_by_control`
         seed = seeds.derive_seed(scene_split.seed, f"search {control}", number)
         return [
             Example.render(problem, seeds.derive_seed(seed, "plain", view))
@@ -451,23 +502,28 @@ class DetectorTrainer(Trainer):
         for module in network.modules():
             if isinstance(module, (_BatchNorm, nn.Dropout)):
                 module.eval()
-
-        def compute_gradient(
-            batch: Sequence[Example], rng: np.random.Generator
-        ) -> None:
-            """Compute the gradient of a batch, half of it mirrored at random."""
-            inputs = list[Tensor]()
-            targets = list[Target]()
-            for item in batch:
-                is_mirrored = bool(rng.random() < 0.5)
-                x, target = self.make_input(item, is_mirrored)
-                inputs.append(x)
-                targets.append(target)
-            network.zero_grad()
-            self.loss(network, torch.cat(inputs), targets).backward()
-
-        yield compute_gradient
+        yield partial(self._compute_batch_gradient, network)
         network.eval()
+
+    def _compute_batch_gradient(
+        self, network: nn.Module, batch: Sequence[Example], rng: np.random.Generator
+    ) -> None:
+        """Compute the gradient of a batch, half of it mirrored at random.
+
+        Args:
+            network: network in training mode, whose parameters get the gradient.
+            batch: images with their ground truth.
+            rng: decides which images are mirrored.
+        """
+        inputs = list[Tensor]()
+        targets = list[Target]()
+        for item in batch:
+            is_mirrored = bool(rng.random() < 0.5)
+            x, target = self.make_input(item, is_mirrored)
+            inputs.append(x)
+            targets.append(target)
+        network.zero_grad()
+        self.loss(network, torch.cat(inputs), targets).backward()
 
     def make_input(self, item: Example, is_mirrored: bool) -> tuple[Tensor, Target]:
         """Return the network's input (1, ...) for an image, and its target.
@@ -484,10 +540,7 @@ class DetectorTrainer(Trainer):
         height, width = item.image_uint8.shape[:2]
         if is_mirrored:
             levels = levels.flip(1)
-            # A mirrored point has x' = width - x, so that the right edge becomes the
-            # left one.
-            x0, y0, x1, y1 = boxes.unbind(dim=1)
-            boxes = torch.stack([width - x1, y0, width - x0, y1], dim=1)
+            boxes = _mirror_boxes(boxes, width)
         # The image is resized to the network's input size, and boxes with it.
         input_height, input_width = self.student.model.input_size
         scale = torch.tensor([input_width / width, input_height / height] * 2)
@@ -525,20 +578,8 @@ class DetectorTrainer(Trainer):
         # Each image is written before it is yielded.
         written_items = write_images(run, f"{directory}/images", new)
         for image_id, (item, name) in enumerate(written_items, start=1):
-            height, width = item.image_uint8.shape[:2]
-            images.append(
-                {
-                    "id": image_id,
-                    "file_name": f"{name}.png",
-                    "height": height,
-                    "width": width,
-                }
-            )
-            for box, label in zip(
-                item.boxes.tolist(), item.labels.tolist(), strict=True
-            ):
-                annotation_id = len(annotations) + 1
-                annotations.append(_annotate(annotation_id, image_id, box, label))
+            images.append(_make_image_entry(image_id, name, item))
+            annotations += _annotate_image(item, image_id, len(annotations) + 1)
         if new:
             coco = self._make_coco(images, annotations)
             run.write_file(f"{directory}/annotations.json", json.dumps(coco).encode())
@@ -563,6 +604,51 @@ def _prepare_single(model: Model, levels: Tensor) -> Tensor:
     # `prepare` fills the batch up to the model's minimum size with copies.
     batch = model.prepare(levels[None] / 255.0)
     return batch[:1]
+
+
+def _mirror_boxes(boxes: Tensor, width: int) -> Tensor:
+    """Return the boxes (K, 4), x0, y0, x1, y1 in pixels, of a mirrored image.
+
+    A mirrored point has x' = width - x, so that the right edge becomes the left one.
+    """
+    x0, y0, x1, y1 = boxes.unbind(dim=1)
+    return torch.stack([width - x1, y0, width - x0, y1], dim=1)
+
+
+def _make_image_entry(image_id: int, name: str, item: Example) -> dict[str, object]:
+    """Return COCO's description of an image.
+
+    Args:
+        image_id: number of the image in the file.
+        name: name of its file, without ".png".
+        item: the image.
+    """
+    height, width = item.image_uint8.shape[:2]
+    return {
+        "id": image_id,
+        "file_name": f"{name}.png",
+        "height": height,
+        "width": width,
+    }
+
+
+def _annotate_image(
+    item: Example, image_id: int, first_annotation_id: int
+) -> list[dict[str, Any]]:
+    """Return the annotations of all boxes of an image in COCO's format.
+
+    Args:
+        item: the image and its boxes.
+        image_id: number of the image in the file.
+        first_annotation_id: number of the first annotation; the others follow.
+    """
+    boxes_and_labels = zip(item.boxes.tolist(), item.labels.tolist(), strict=True)
+    return [
+        _annotate(annotation_id, image_id, box, label)
+        for annotation_id, (box, label) in enumerate(
+            boxes_and_labels, start=first_annotation_id
+        )
+    ]
 
 
 def _annotate(
@@ -638,9 +724,7 @@ class SegmenterTrainer(DetectorTrainer):
         """
         region: Any = item.truth
         levels = item.image_uint8.flip(1) if is_mirrored else item.image_uint8
-        with torch.no_grad():
-            original_output = self.scene_jobs.model(levels[None] / 255.0)
-        original_classes = original_output[0].argmax(dim=0)
+        original_classes = self._predict_original_classes(levels)
         output_size = tuple(original_classes.shape)
         is_object = region.resize_mask(output_size).to(original_classes.device)
         if is_mirrored:
@@ -652,6 +736,17 @@ class SegmenterTrainer(DetectorTrainer):
             "classes": classes.to(x.device),
             "object": is_object.to(x.device),
         }
+
+    def _predict_original_classes(self, levels: Tensor) -> Tensor:
+        """Return the classes (h, w) int64 that the original model predicts.
+
+        Args:
+            levels: image (H, W, 3) uint8.
+        """
+        with torch.no_grad():
+            original_output = self.scene_jobs.model(levels[None] / 255.0)
+        classes: Tensor = original_output[0].argmax(dim=0)
+        return classes
 
     def save_images(
         self, run: RunDirectory, number: int, new: Sequence[Example]
@@ -689,6 +784,16 @@ def compute_pixel_loss(
         return loss
     logits = task.read(network(x), len(x))
     pixel_losses = F.cross_entropy(logits, classes, reduction="none")
+    return _average_object_and_rest(pixel_losses, is_object)
+
+
+def _average_object_and_rest(pixel_losses: Tensor, is_object: Tensor) -> Tensor:
+    """Return half the mean loss of the object's pixels plus half that of the others.
+
+    Args:
+        pixel_losses: loss of each pixel (N, h, w).
+        is_object: the object's pixels (N, h, w) bool.
+    """
     # starts with zero, with a graph to all parameters even if there are no pixels
     total = pixel_losses.sum() * 0.0
     for mask in (is_object, ~is_object):

@@ -220,36 +220,63 @@ def _make_texture_lessons(
         seed: root of the samples.
         shares_texture: whether all views share one texture.
     """
-    right_classes = _find_right_classes(problem)
-    domain = problem.domain
     # The lessons stay in memory during the full training, so they have spaces without
     # the scene, which is large.
-    searched_space = replace(problem.searched_space, scene=None)
     full_space = replace(problem.space, scene=None)
-    shared_texture = _sample_texture(domain, seed)
-    texture_lessons = []
-    for number in range(views):
-        view_seed = seeds.derive_seed(seed, "lesson", number)
-        configuration = problem.make_full_configuration(domain.start, view_seed)
-        linear = problem.make_linear_renderer(configuration, view_seed, MATRIX_SPP)
-        levels = color.to_uint8(linear(configuration))
-        linear.release_scene(full_space)  # keeps only the matrix and this space
-        texture = shared_texture
-        if not shares_texture:
-            texture = _sample_texture(domain, view_seed)
-        texture_lessons.append(
-            TextureLesson(
-                right_classes=right_classes,
-                plain_image_uint8=levels,
-                space=searched_space,
-                domain=domain,
-                image_predictor=linear,
-                # A slice would keep the full configuration in memory, a clone does not.
-                conditions=configuration[domain.dim :].clone(),
-                texture=texture,
-            )
+    make_lesson = partial(
+        TextureLesson,
+        right_classes=_find_right_classes(problem),
+        space=replace(problem.searched_space, scene=None),
+        domain=problem.domain,
+    )
+    view_seeds = [seeds.derive_seed(seed, "lesson", number) for number in range(views)]
+    textures = _sample_textures(problem.domain, seed, view_seeds, shares_texture)
+    return [
+        make_lesson(
+            texture=texture, **_make_view_fields(problem, full_space, view_seed)
         )
-    return texture_lessons
+        for texture, view_seed in zip(textures, view_seeds, strict=True)
+    ]
+
+
+def _sample_textures(
+    domain: policies.Domain,
+    seed: int,
+    view_seeds: Sequence[int],
+    shares_texture: bool,
+) -> list[Tensor]:
+    """Sample the first texture (d,) of each view of a scene.
+
+    Args:
+        domain: the searched space with its bounds.
+        seed: seed of the texture that all views share.
+        view_seeds: seeds of the textures of views that share none.
+        shares_texture: whether all views get one tensor.
+    """
+    if shares_texture:
+        return [_sample_texture(domain, seed)] * len(view_seeds)
+    return [_sample_texture(domain, view_seed) for view_seed in view_seeds]
+
+
+def _make_view_fields(problem: Problem, full_space: Any, seed: int) -> dict[str, Any]:
+    """Return the fields of a `TextureLesson` that belong to one view of the scene.
+
+    Args:
+        problem: the scene with the controls that are searched.
+        full_space: the problem's space without the scene.
+        seed: seed of the conditions of the view, and of the noise.
+    """
+    domain = problem.domain
+    configuration = problem.make_full_configuration(domain.start, seed)
+    linear = problem.make_linear_renderer(configuration, seed, MATRIX_SPP)
+    levels = color.to_uint8(linear(configuration))
+    linear.release_scene(full_space)  # keeps only the matrix and this space
+    return {
+        "plain_image_uint8": levels,
+        "image_predictor": linear,
+        # A slice would keep the full configuration in memory, a clone does not.
+        "conditions": configuration[domain.dim :].clone(),
+    }
 
 
 def _sample_texture(domain: policies.Domain, seed: int) -> Tensor:
@@ -276,21 +303,37 @@ def _make_rendered_lessons(
     """
     right_classes = _find_right_classes(problem)
     render = problem.renderer.copy_with(quick=True)
-    domain = problem.domain
     rendered_lessons = []
     for number in range(views):
         view_seed = seeds.derive_seed(seed, "lesson", number)
-        # A full configuration has the searched coordinates, then the conditions.
-        full_start = problem.make_full_configuration(domain.start, view_seed)
-        conditions = full_start[domain.dim :].clone()
-        plain_image, *images = [
-            render(torch.cat([u, conditions]), seed=view_seed, spp=SPP)
-            for u in _sample_lesson_configurations(problem, view_seed, n_tries)
-        ]
+        plain_image, *images = _render_lesson_images(
+            problem, render, view_seed, n_tries
+        )
         rendered_lessons.append(
             RenderedLesson.create(right_classes, plain_image, torch.stack(images))
         )
     return rendered_lessons
+
+
+def _render_lesson_images(
+    problem: Problem, render: Renderer, seed: int, n_tries: int | None
+) -> list[Tensor]:
+    """Render the images (H, W, 3) of a lesson, the plain one first.
+
+    Args:
+        problem: the scene with the controls that are varied.
+        render: renders a full configuration.
+        seed: seed of the configurations, the conditions and the noise.
+        n_tries: number of random configurations, or None.
+    """
+    domain = problem.domain
+    # A full configuration has the searched coordinates, then the conditions.
+    full_start = problem.make_full_configuration(domain.start, seed)
+    conditions = full_start[domain.dim :].clone()
+    return [
+        render(torch.cat([u, conditions]), seed=seed, spp=SPP)
+        for u in _sample_lesson_configurations(problem, seed, n_tries)
+    ]
 
 
 def _sample_lesson_configurations(
@@ -350,12 +393,7 @@ def sample_configurations(
         count: number of configurations.
     """
     samples = domain.sample(generator, count)  # (count, d)
-    is_at_bound = torch.rand(samples.shape, generator=generator) < 0.5
-    uses_bounds = torch.rand(count, 1, generator=generator) < 0.5
-    is_at_bound = is_at_bound & uses_bounds
-    for block, columns in domain.list_block_slices():
-        if block.n_options or block.periodic:
-            is_at_bound[:, columns] = False
+    is_at_bound = _choose_values_at_bounds(domain, generator, count)
     is_unchanged = _alternate_controls(domain, count)
     is_lower_nearer = samples - domain.lower_bounds < domain.upper_bounds - samples
     nearer_bound = torch.where(
@@ -364,6 +402,22 @@ def sample_configurations(
     samples = torch.where(is_at_bound, nearer_bound, samples)
     samples = torch.where(is_unchanged, domain.start, samples)
     return torch.stack([domain.project(u) for u in samples])
+
+
+def _choose_values_at_bounds(
+    domain: policies.Domain, generator: torch.Generator, count: int
+) -> Tensor:
+    """Choose at random which values (count, d) of configurations move to a bound.
+
+    Half of the configurations have none. Choices and periodic values have no bounds.
+    """
+    is_at_bound = torch.rand((count, domain.dim), generator=generator) < 0.5
+    uses_bounds = torch.rand(count, 1, generator=generator) < 0.5
+    is_at_bound = is_at_bound & uses_bounds
+    for block, columns in domain.list_block_slices():
+        if block.n_options or block.periodic:
+            is_at_bound[:, columns] = False
+    return is_at_bound
 
 
 def _alternate_controls(domain: policies.Domain, count: int) -> Tensor:
@@ -450,19 +504,26 @@ def _update_losses(batch: Sequence[Lesson], model: Model) -> None:
     ]
     if not rendered_lessons:
         return
+    losses = _evaluate_rendered_images(rendered_lessons, model)
     n_images = [len(lesson.images_uint8) for lesson in rendered_lessons]
-    right_classes = []
-    for lesson in rendered_lessons:
-        right_classes += [lesson.right_classes] * len(lesson.images_uint8)
-    with torch.no_grad():
-        images = torch.cat([lesson.images_uint8 for lesson in rendered_lessons]) / 255.0
-        losses = negative_log_likelihood(model(images), right_classes)
     for lesson, lesson_losses in zip(
         rendered_lessons, losses.split(n_images), strict=True
     ):
         # `clone`, as `split` returns views that keep the losses of all lessons in
         # memory.
         lesson.losses = lesson_losses.clone()
+
+
+def _evaluate_rendered_images(
+    rendered_lessons: Sequence[RenderedLesson], model: Model
+) -> Tensor:
+    """Return the losses (N,) of the images of lessons, one lesson after the other."""
+    right_classes = []
+    for lesson in rendered_lessons:
+        right_classes += [lesson.right_classes] * len(lesson.images_uint8)
+    with torch.no_grad():
+        images = torch.cat([lesson.images_uint8 for lesson in rendered_lessons]) / 255.0
+        return negative_log_likelihood(model(images), right_classes)
 
 
 def ascend_textures(
@@ -489,18 +550,34 @@ def ascend_textures(
     # Lessons that share a texture have the same tensor: one of them stands for all.
     lesson_of_texture = {id(lesson.texture): lesson for lesson in texture_lessons}
     for _ in range(steps):
-        gradient_sums = dict[int, Tensor]()  # by the id of the texture
         gradients = compute_gradients(texture_lessons)
-        for lesson, gradient in zip(texture_lessons, gradients, strict=True):
-            texture_id = id(lesson.texture)
-            gradient_sums[texture_id] = gradient + gradient_sums.get(texture_id, 0.0)
+        gradient_sums = _sum_by_texture(texture_lessons, gradients)
         for texture_id, lesson in lesson_of_texture.items():
-            # Its length is 1 in the norm of the domain.
-            direction = lesson.domain.compute_steepest_step(
-                lesson.texture, gradient_sums[texture_id]
-            )
-            moved_texture = lesson.texture + STEP_FRACTION * direction
-            lesson.texture.copy_(lesson.domain.project(moved_texture))
+            _move_texture(lesson, gradient_sums[texture_id])
+
+
+def _sum_by_texture(
+    texture_lessons: Sequence[TextureLesson], gradients: Sequence[Tensor]
+) -> dict[int, Tensor]:
+    """Return the sum of the gradients (d,) of each texture, by the `id` of the texture.
+
+    Args:
+        texture_lessons: lessons, some of which may share a texture.
+        gradients: gradient of each lesson.
+    """
+    gradient_sums = dict[int, Tensor]()
+    for lesson, gradient in zip(texture_lessons, gradients, strict=True):
+        texture_id = id(lesson.texture)
+        gradient_sums[texture_id] = gradient + gradient_sums.get(texture_id, 0.0)
+    return gradient_sums
+
+
+def _move_texture(lesson: TextureLesson, gradient: Tensor) -> None:
+    """Take a step of steepest ascent with the texture of a lesson, in place."""
+    # Its length is 1 in the norm of the domain.
+    direction = lesson.domain.compute_steepest_step(lesson.texture, gradient)
+    moved_texture = lesson.texture + STEP_FRACTION * direction
+    lesson.texture.copy_(lesson.domain.project(moved_texture))
 
 
 def compute_texture_gradients(
@@ -544,9 +621,7 @@ def save_lesson_images(
         labels: names of the model's classes.
     """
     for index, lesson in enumerate(selected):
-        class_index = lesson.right_classes[0]
-        label = re.sub(r"[^a-z0-9]+", "-", labels[class_index].lower()).strip("-")
-        class_directory = f"{IMAGE_DIRECTORY}/{class_index:04d}-{label}"
+        class_directory = _name_class_directory(lesson.right_classes[0], labels)
         (run.path / class_directory).mkdir(parents=True, exist_ok=True)
         name = f"{number:03d}-{index:05d}"
         run.save_image(f"{name}-plain", lesson.plain_image, class_directory)
@@ -554,6 +629,12 @@ def save_lesson_images(
         if has_worst_image:
             run.save_image(f"{name}-worst", lesson.worst_image, class_directory)
     _write_webdataset(run.path / IMAGE_DIRECTORY)
+
+
+def _name_class_directory(class_index: int, labels: Sequence[str]) -> str:
+    """Return the directory of the images of a class, relative to the run."""
+    label = re.sub(r"[^a-z0-9]+", "-", labels[class_index].lower()).strip("-")
+    return f"{IMAGE_DIRECTORY}/{class_index:04d}-{label}"
 
 
 def _write_webdataset(directory: Path) -> None:
@@ -566,17 +647,24 @@ def _write_webdataset(directory: Path) -> None:
         tarfile.open(temporary_path, "w") as tar,
     ):
         for path in sorted(directory.glob("*/*.png")):
-            # CLASS-LABEL/ROUND-LESSON-KIND.png
-            class_digits, _, _ = path.parent.name.partition("-")
-            class_index = int(class_digits)
-            _, _, kind = path.stem.rpartition("-")
-            metadata = json.dumps({"class": class_index, "kind": kind})
-            data_by_suffix = {
-                "png": path.read_bytes(),
-                "cls": str(class_index).encode(),
-                "json": metadata.encode(),
-            }
-            for suffix, data in data_by_suffix.items():
+            for suffix, data in _make_webdataset_sample(path).items():
                 member = tarfile.TarInfo(f"{path.parent.name}-{path.stem}.{suffix}")
                 member.size = len(data)
                 tar.addfile(member, io.BytesIO(data))
+
+
+def _make_webdataset_sample(path: Path) -> dict[str, bytes]:
+    """Return the content of the files of an image in a WebDataset, by their suffix.
+
+    Args:
+        path: the image, CLASS-LABEL/ROUND-LESSON-KIND.png.
+    """
+    class_digits, _, _ = path.parent.name.partition("-")
+    class_index = int(class_digits)
+    _, _, kind = path.stem.rpartition("-")
+    metadata = json.dumps({"class": class_index, "kind": kind})
+    return {
+        "png": path.read_bytes(),
+        "cls": str(class_index).encode(),
+        "json": metadata.encode(),
+    }

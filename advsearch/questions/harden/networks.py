@@ -108,19 +108,25 @@ def make_trainable(
     network = model.copy_network()
     network.eval().requires_grad_(True)
     if layers == "last":
-        # Layers come in the order of their definition, so the last one is usually the
-        # head.
-        layers_with_parameters = [
-            layer
-            for layer in network.modules()
-            if next(layer.parameters(recurse=False), None) is not None
-        ]
-        network.requires_grad_(False)
-        layers_with_parameters[-1].requires_grad_(True)
+        _freeze_all_but_last_layer(network)
     trainable = Trainable(network, model.with_network(network))
     if not trainable.parameters():
         raise errors.ModelError(f"model {model.name}: has no parameters to train")
     return trainable
+
+
+def _freeze_all_but_last_layer(network: nn.Module) -> None:
+    """Let only the parameters of the last layer that has some collect gradients.
+
+    Layers come in the order of their definition, so the last one is usually the head.
+    """
+    layers_with_parameters = [
+        layer
+        for layer in network.modules()
+        if next(layer.parameters(recurse=False), None) is not None
+    ]
+    network.requires_grad_(False)
+    layers_with_parameters[-1].requires_grad_(True)
 
 
 @contextmanager
@@ -194,55 +200,42 @@ class Augmentation:
 
         Each image gets its own random crop. The size of the images stays the same.
         """
-        count = len(images)
-        scale = _uniform(
-            self.smallest_crop, self.largest_crop, count, generator=generator
-        )
-        # In the coordinates of `affine_grid` the image extends from -1 to 1, and a crop
-        # from -scale to scale around its center. If the center is moved by at most
-        # |1 - scale|, a smaller crop stays inside the image, and a larger one contains
-        # it. (A rotation is ignored here.)
-        relative_shift = _uniform(-1.0, 1.0, count, 2, generator=generator)
-        max_shift = (1.0 - scale).abs()
-        # The samples are flat: the first half of them is for x, the second for y.
-        shift_x, shift_y = relative_shift.view(2, count) * max_shift
-        is_mirrored = _choose(self.flip, count, generator)
-        mirror = 1.0 - 2.0 * is_mirrored.float()  # -1 or 1
-        degrees = _uniform(
-            -self.max_rotation_degrees,
-            self.max_rotation_degrees,
-            count,
-            generator=generator,
-        )
-        angle = degrees * (math.pi / 180.0)
-        cosine = scale * angle.cos()
-        sine = scale * angle.sin()
-        # rows of the matrices from coordinates of the crop to those of the image
-        rows = (
-            torch.stack([cosine * mirror, -sine, shift_x], 1),
-            torch.stack([sine * mirror, cosine, shift_y], 1),
-        )
-        grid = F.affine_grid(
-            torch.stack(rows, 1), list(images.shape), align_corners=False
-        )
+        matrices = self._sample_crop_matrices(len(images), generator)
+        grid = F.affine_grid(matrices, list(images.shape), align_corners=False)
         return F.grid_sample(
             images, grid, mode="bilinear", padding_mode="border", align_corners=False
         )
 
+    def _sample_crop_matrices(self, count: int, generator: Generator) -> Tensor:
+        """Sample matrices (count, 2, 3) from coordinates of a crop to those of its image.
+
+        In the coordinates of `affine_grid` an image extends from -1 to 1, and a crop from
+        -scale to scale around its center.
+        """
+        scale = _uniform(
+            self.smallest_crop, self.largest_crop, count, generator=generator
+        )
+        shift_x, shift_y = _sample_crop_shifts(scale, generator)
+        is_mirrored = _choose(self.flip, count, generator)
+        mirror = 1.0 - 2.0 * is_mirrored.float()  # -1 or 1
+        degrees = _sample_around_zero(
+            self.max_rotation_degrees, count, generator=generator
+        )
+        angle = degrees * (math.pi / 180.0)
+        cosine = scale * angle.cos()
+        sine = scale * angle.sin()
+        x_row = torch.stack([cosine * mirror, -sine, shift_x], dim=1)
+        y_row = torch.stack([sine * mirror, cosine, shift_y], dim=1)
+        return torch.stack([x_row, y_row], dim=1)
+
     def _change_colors(self, x: Tensor, generator: Generator) -> Tensor:
         """Change contrast, brightness and color of images (N, 3, H, W)."""
         count = len(x)
-        contrast = _uniform(-self.contrast, self.contrast, count, generator=generator)
-        color = _uniform(
-            -self.max_channel_change,
-            self.max_channel_change,
-            count,
-            3,
-            generator=generator,
+        contrast = _sample_around_zero(self.contrast, count, generator=generator)
+        color = _sample_around_zero(
+            self.max_channel_change, count, 3, generator=generator
         )
-        brightness = _uniform(
-            -self.brightness, self.brightness, count, generator=generator
-        )
+        brightness = _sample_around_zero(self.brightness, count, generator=generator)
         contrast_factor = 1.0 + contrast.view(count, 1, 1, 1)
         color_factor = 1.0 + color.view(count, 3, 1, 1)
         mean = x.mean(dim=(1, 2, 3), keepdim=True)
@@ -284,6 +277,24 @@ class Augmentation:
             row = int(top * (height - side))
             column = int(left * (width - side))
             x[index, :, row : row + side, column : column + side] = gray
+
+
+def _sample_crop_shifts(scale: Tensor, generator: Generator) -> Tensor:
+    """Sample shifts (2, N) of the centers of crops, x and then y, from their scales (N,).
+
+    If the center is moved by at most |1 - scale|, a smaller crop stays inside the image,
+    and a larger one contains it. (A rotation is ignored here.)
+    """
+    count = len(scale)
+    # The samples are flat: the first half of them is for x, the second for y.
+    relative_shift = _sample_around_zero(1.0, count, 2, generator=generator)
+    max_shift = (1.0 - scale).abs()
+    return relative_shift.view(2, count) * max_shift
+
+
+def _sample_around_zero(bound: float, *shape: int, generator: Generator) -> Tensor:
+    """Return uniform samples (N,) between -bound and bound; N is that of `_uniform`."""
+    return _uniform(-bound, bound, *shape, generator=generator)
 
 
 def _uniform(lower: float, upper: float, *shape: int, generator: Generator) -> Tensor:

@@ -323,7 +323,18 @@ def make_harden_view(result: HardenResult) -> ShownResult:
 
     The page has all tables; the terminal has the text, the facts and the first table.
     """
-    facts = {
+    sections = [_make_robustness_part(result), *_make_training_parts(result)]
+    return ShownResult(
+        _summarize(result),
+        sections,
+        _list_facts(result),
+        about=[",".join(result.objects), ", ".join(result.controls)],
+    )
+
+
+def _list_facts(result: HardenResult) -> dict[str, str]:
+    """Return the model, the searches and the files of the run, by what they are."""
+    return {
         "model": result.model,
         "searched with": result.search,
         "stronger": result.stronger_search,
@@ -331,8 +342,11 @@ def make_harden_view(result: HardenResult) -> ShownResult:
         "weights": result.weights or "",
         "pictures": result.pictures or "",
     }
-    sections = [
-        _make_robustness_part(result),
+
+
+def _make_training_parts(result: HardenResult) -> list[ResultPart]:
+    """Return the table of the rounds and that of the split of scenes."""
+    return [
         ResultPart.make_table(
             enumerate(result.rounds),
             ROUND_COLUMNS,
@@ -347,34 +361,33 @@ def make_harden_view(result: HardenResult) -> ShownResult:
             only_medium="page",
         ),
     ]
-    return ShownResult(
-        _summarize(result),
-        sections,
-        facts,
-        about=[",".join(result.objects), ", ".join(result.controls)],
-    )
 
 
 def _make_robustness_part(result: HardenResult) -> ResultPart:
     """Return the table of fractions before and after, with a chart if it has rows."""
     shares = _list_shares(result)
-    chart: dict[str, Any] = {}
-    if shares:
-        chart = {
-            "draw": partial(_draw_shares, shares=shares, model=result.model),
-            "size": (6.4, 1.4 + 0.45 * len(shares)),
-        }
+    rows = [
+        [name, *_share_cells(before), *_share_cells(after)]
+        for name, (before, after) in shares.items()
+    ]
     return ResultPart(
         "Before and after",
         column_heads=HEADS,
-        rows=[
-            [name, *_share_cells(before), *_share_cells(after)]
-            for name, (before, after) in shares.items()
-        ],
+        rows=rows,
         note=ROBUST_NOTE,
         height=110 + 44 * len(shares),
-        **chart,
+        **_make_share_chart(shares, result.model),
     )
+
+
+def _make_share_chart(shares: ShareChanges, model: str) -> dict[str, Any]:
+    """Return the fields of a part with a chart of fractions; none without fractions."""
+    if not shares:
+        return {}
+    return {
+        "draw": partial(_draw_shares, shares=shares, model=model),
+        "size": (6.4, 1.4 + 0.45 * len(shares)),
+    }
 
 
 def _list_shares(
@@ -434,38 +447,68 @@ def _summarize(result: HardenResult) -> str:
         f"of {clean_after.count} plain pictures {clean_after.right} are right, before "
         f"{clean_before.right}."
     )
-    for when, share in (("Now", clean_after), ("Before", clean_before)):
-        outcomes = wording.format_outcomes(share.outcomes, result.task)
-        if outcomes:
-            text += f" {when}, the other plain pictures are {outcomes}."
-    # `lost` is None if the scenes before and after cannot be compared one by one.
-    if result.lost is not None:
-        text += (
-            f" Scene by scene: {result.gained} got better, {result.lost} worse "
-            f"(p = {result.p:.2g}, for scenes of these objects and not for other "
-            "objects)."
-        )
-    return text
+    text += _describe_plain_outcomes("Now", clean_after, result.task)
+    text += _describe_plain_outcomes("Before", clean_before, result.task)
+    return text + _describe_changed_scenes(result)
+
+
+def _describe_plain_outcomes(when: str, share: Share, task: str) -> str:
+    """Describe what becomes of the object in plain images that are not right.
+
+    The result begins with a space; it is empty if nothing is known about that.
+
+    Args:
+        when: "Now" or "Before".
+        share: the fraction of plain images that are right.
+        task: the task that evaluates the predictions.
+    """
+    outcomes = wording.format_outcomes(share.outcomes, task)
+    return f" {when}, the other plain pictures are {outcomes}." if outcomes else ""
+
+
+def _describe_changed_scenes(result: HardenResult) -> str:
+    """Describe in how many scenes the model got better or worse, after a space.
+
+    The text is empty if the scenes before and after cannot be compared one by one.
+    """
+    if result.lost is None:
+        return ""
+    return (
+        f" Scene by scene: {result.gained} got better, {result.lost} worse "
+        f"(p = {result.p:.2g}, for scenes of these objects and not for other "
+        "objects)."
+    )
 
 
 def make_harden_claims(result: HardenResult) -> Iterator[views.Claim]:
     """Yield the fractions of held-out scenes without a failure, before and after."""
     for when, share in (("Before", result.before), ("After hardening", result.after)):
         if share is not None:
-            extent = {
-                "what": "held-out scenes",
-                "count": share.right,
-                "of": share.count,
-                "interval": share.interval,
-                "counts_right": True,
-            }
-            text = (
-                f"{when}, the searches ({result.search}) found no failure in "
-                f"{share.right} of {share.count} "
-                f"({wording.percent(share.accuracy)}, 95 % interval "
-                f"{wording.format_interval(share.interval)}) held-out "
-                "scenes. This does not show that there is none."
-            )
-            yield views.Claim.from_values(
-                {"kind": "measured", "statement": text, "extent": extent}
-            )
+            yield _make_share_claim(when, share, result.search)
+
+
+def _make_share_claim(when: str, share: Share, search: str) -> views.Claim:
+    """Return the claim of how many held-out scenes have no failure.
+
+    Args:
+        when: "Before" or "After hardening".
+        share: the scenes without a failure.
+        search: description of the search.
+    """
+    extent = {
+        "what": "held-out scenes",
+        "count": share.right,
+        "of": share.count,
+        "interval": share.interval,
+        "counts_right": True,
+    }
+    accuracy = wording.percent(share.accuracy)
+    interval = wording.format_interval(share.interval)
+    text = (
+        f"{when}, the searches ({search}) found no failure in {share.right} of "
+        f"{share.count} ({accuracy}, 95 % interval {interval}) held-out scenes. This "
+        "does not show that there is none."
+    )
+    return views.Claim.from_values(
+        {"kind": "measured", "statement": text, "extent": extent}
+    )

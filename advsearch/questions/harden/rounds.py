@@ -167,23 +167,24 @@ class Trainer(ABC):
             parameters, self.count_steps(training_items)
         )
         average = [parameter.detach().clone() for parameter in parameters]
-        # `_iterate_batches` shuffles an epoch when it begins. Gradients draw from the same
-        # generator in between.
-        rng = np.random.default_rng(
-            [seeds.derive_seed(self.config.seed, "order"), number]
-        )
+        rng = self._make_order_generator(number)
         with self.open_gradient_context(new) as compute_gradient:
             batches = self._iterate_batches(training_items, rng)
             for n_steps, batch in enumerate(batches, start=1):
                 compute_gradient(batch, rng)
-                # Without a limit, a few very wrong images could make a step so large
-                # that it undoes others.
-                nn.utils.clip_grad_norm_(parameters, MAX_GRADIENT_NORM)
-                optimizer.step()
-                schedule.step()
+                _take_step(parameters, optimizer, schedule)
                 self._update_average(n_steps, average, parameters)
                 tick()
         _copy_average(average, parameters)
+
+    def _make_order_generator(self, number: int) -> np.random.Generator:
+        """Return the random generator of a round.
+
+        It shuffles each epoch when the epoch begins (`_iterate_batches`). In between,
+        gradients sample from it.
+        """
+        order_seed = seeds.derive_seed(self.config.seed, "order")
+        return np.random.default_rng([order_seed, number])
 
     def _iterate_batches(
         self, pool: Sequence[Any], rng: np.random.Generator
@@ -228,9 +229,6 @@ class Trainer(ABC):
     ) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
         """Create the optimizer of a round, and its schedule of learning rates.
 
-        The rate rises to its maximum in the warm-up and then falls to nearly 0 (one
-        cycle, Smith and Topin 2018, arXiv 1708.07120).
-
         Args:
             parameters: parameters that are trained.
             n_steps: number of steps of the round.
@@ -239,18 +237,48 @@ class Trainer(ABC):
             torch.optim.AdamW, lr=self.config.rate, weight_decay=self.weight_decay
         )
         optimizer = make_optimizer(parameters)
-        # `train_round` calls `schedule.step` after each step, also after the last one. So
-        # the schedule has a further rate, which is not used.
-        n_rates = n_steps + 1
-        schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimizer,
-            [float(group["lr"]) for group in optimizer.param_groups],
-            total_steps=n_rates,
-            pct_start=adjust_warm_up(self.warm_up_fraction, n_rates),
-            # not every optimizer has a momentum
-            cycle_momentum=False,
-        )
-        return optimizer, schedule
+        return optimizer, _make_schedule(optimizer, n_steps, self.warm_up_fraction)
+
+
+def _make_schedule(
+    optimizer: torch.optim.Optimizer, n_steps: int, warm_up_fraction: float
+) -> torch.optim.lr_scheduler.LRScheduler:
+    """Create the schedule of learning rates of a round.
+
+    The rate rises to its maximum in the warm-up and then falls to nearly 0 (one
+    cycle, Smith and Topin 2018, arXiv 1708.07120).
+
+    Args:
+        optimizer: optimizer, whose rates are the maximum.
+        n_steps: number of steps of the round.
+        warm_up_fraction: fraction of the steps in which the rate rises.
+    """
+    # `train_round` calls `schedule.step` after each step, also after the last one. So
+    # the schedule has a further rate, which is not used.
+    n_rates = n_steps + 1
+    return torch.optim.lr_scheduler.OneCycleLR(
+        optimizer,
+        [float(group["lr"]) for group in optimizer.param_groups],
+        total_steps=n_rates,
+        pct_start=adjust_warm_up(warm_up_fraction, n_rates),
+        # not every optimizer has a momentum
+        cycle_momentum=False,
+    )
+
+
+def _take_step(
+    parameters: Sequence[nn.Parameter],
+    optimizer: torch.optim.Optimizer,
+    schedule: torch.optim.lr_scheduler.LRScheduler,
+) -> None:
+    """Change parameters by their gradient, whose norm is limited.
+
+    Without a limit, a few very wrong images could make a step so large that it undoes
+    others.
+    """
+    nn.utils.clip_grad_norm_(parameters, MAX_GRADIENT_NORM)
+    optimizer.step()
+    schedule.step()
 
 
 def _copy_average(average: Sequence[Tensor], parameters: Sequence[Tensor]) -> None:
@@ -361,29 +389,15 @@ class Rounds:
         stored: those of earlier rounds are sampled again from their seeds, since later
         rounds train on them too.
         """
-        trainer = self.trainer
-        n_scenes = self.config.scenes
-        held_back = trainer.sample_items(
-            "drawing scenes for the choice of weights",
-            VALIDATION,
-            range(self.n_validation_scenes),
-        )
+        held_back = self._sample_validation_items()
         if not self.finished_rounds:
-            self.progress.stage("evaluating the original model")
-            original_score = trainer.evaluate_student(held_back)
-            self.store_round(0, [], original_score, n_trained=0, interpolation=0.0)
-        pool = list(trainer.custom_items)
+            self._evaluate_original(held_back)
+        pool = list(self.trainer.custom_items)
         # Items at the start of the pool that a round of this session has trained on.
         n_used = 0
         # Round 0 is the original model, so the first round of training is 1.
         for number in range(1, self.config.rounds + 1):
-            # A round starts with the weights of the round before.
-            trainer.student.network.load_state_dict(self.read_weights(number - 1))
-            new_items = trainer.sample_items(
-                f"round {number}: drawing scenes",
-                TRAINING,
-                range((number - 1) * n_scenes, number * n_scenes),
-            )
+            new_items = self._begin_round(number)
             pool += new_items
             is_done_before = number < len(self.finished_rounds)  # in an earlier session
             if is_done_before:
@@ -391,6 +405,31 @@ class Rounds:
             score, interpolation = self._train(number, pool, n_used, held_back)
             n_used = len(pool)
             self.store_round(number, new_items, score, len(pool), interpolation)
+
+    def _sample_validation_items(self) -> list[Any]:
+        """Sample the items by which weights are chosen."""
+        return self.trainer.sample_items(
+            "drawing scenes for the choice of weights",
+            VALIDATION,
+            range(self.n_validation_scenes),
+        )
+
+    def _evaluate_original(self, held_back: Sequence[Any]) -> None:
+        """Store round 0, the score of the original model on items of the validation."""
+        self.progress.stage("evaluating the original model")
+        original_score = self.trainer.evaluate_student(held_back)
+        self.store_round(0, [], original_score, n_trained=0, interpolation=0.0)
+
+    def _begin_round(self, number: int) -> list[Any]:
+        """Load the weights of the round before into the student, and sample new items."""
+        network = self.trainer.student.network
+        network.load_state_dict(self.read_weights(number - 1))
+        n_scenes = self.config.scenes
+        return self.trainer.sample_items(
+            f"round {number}: drawing scenes",
+            TRAINING,
+            range((number - 1) * n_scenes, number * n_scenes),
+        )
 
     def _train(
         self, number: int, pool: Sequence[Any], n_used: int, held_back: Sequence[Any]
@@ -431,11 +470,6 @@ class Rounds:
         on the worst images. If none has enough, the best one has the highest clean
         accuracy.
 
-        `INTERPOLATIONS` are tried from the trained weights towards the original ones.
-        Mixtures nearer to the original weights have learned less, so once the accuracy
-        on worst images falls, the others are not evaluated: each would take a search of
-        its own.
-
         Args:
             held_back: items of the validation split, which are not trained on.
 
@@ -447,25 +481,57 @@ class Rounds:
         trained = {
             name: weight.clone() for name, weight in network.state_dict().items()
         }
-        scores = dict[float, Score]()  # by interpolation
-        allowed_scores = dict[float, Score]()  # those with enough clean accuracy
-        for interpolation in INTERPOLATIONS:
-            network.load_state_dict(_interpolate(original, trained, interpolation))
-            score = self.trainer.evaluate_student(held_back)
-            scores[interpolation] = score
-            self.progress.advance(1, worst=score.robust)
-            if self.is_allowed(score.clean):
-                allowed_scores[interpolation] = score
-            robust = [allowed_score.robust for allowed_score in allowed_scores.values()]
-            has_fallen = bool(robust) and robust[-1] < max(robust)
-            if has_fallen:
-                break
+        scores = self._score_interpolations(original, trained, held_back)
+        allowed_scores = self._select_allowed(scores)
         if allowed_scores:
             best = max(allowed_scores, key=lambda key: allowed_scores[key].robust)
         else:
             best = max(scores, key=lambda key: scores[key].clean)
         network.load_state_dict(_interpolate(original, trained, best))
         return scores[best], best
+
+    def _score_interpolations(
+        self,
+        original: Mapping[str, Tensor],
+        trained: Mapping[str, Tensor],
+        held_back: Sequence[Any],
+    ) -> dict[float, Score]:
+        """Return the scores of mixtures of weights by their interpolation.
+
+        `INTERPOLATIONS` are tried from the trained weights towards the original ones.
+        Mixtures nearer to the original weights have learned less, so once the accuracy
+        on worst images falls, the others are not evaluated: each would take a search of
+        its own.
+
+        Args:
+            original: weights of the original model.
+            trained: weights after the training of the round.
+            held_back: items of the validation split.
+        """
+        scores = dict[float, Score]()
+        for interpolation in INTERPOLATIONS:
+            mixture = _interpolate(original, trained, interpolation)
+            self.trainer.student.network.load_state_dict(mixture)
+            score = self.trainer.evaluate_student(held_back)
+            scores[interpolation] = score
+            self.progress.advance(1, worst=score.robust)
+            if self._has_fallen(scores):
+                break
+        return scores
+
+    def _has_fallen(self, scores: Mapping[float, Score]) -> bool:
+        """Return whether the last allowed score is less robust than an earlier one."""
+        allowed_scores = self._select_allowed(scores).values()
+        robust = [score.robust for score in allowed_scores]
+        return bool(robust) and robust[-1] < max(robust)
+
+    def _select_allowed(self, scores: Mapping[float, Score]) -> dict[float, Score]:
+        """Return the scores with enough clean accuracy, in the same order."""
+        return {
+            interpolation: score
+            for interpolation, score in scores.items()
+            if self.is_allowed(score.clean)
+        }
 
     def store_round(
         self,
@@ -498,15 +564,23 @@ class Rounds:
                 is_selected=False,
             )
         )
-        stored_results = [
-            training_round.model_dump() for training_round in self.finished_rounds
-        ]
-        self.run.store.write_note(ROUNDS_NOTE, json.dumps(stored_results))
+        self._write_results()
+        self._report_round(number, score)
+
+    def _report_round(self, number: int, score: Score) -> None:
+        """Report the accuracies of a round to the user."""
         clean = wording.percent(score.clean)
         worst = wording.percent(score.robust)
         self.progress.message(
             f"round {number}: {clean} of plain pictures right, {worst} of the worst"
         )
+
+    def _write_results(self) -> None:
+        """Store the results of all rounds so far as a note of the run."""
+        stored_results = [
+            training_round.model_dump() for training_round in self.finished_rounds
+        ]
+        self.run.store.write_note(ROUNDS_NOTE, json.dumps(stored_results))
 
     def write_weights(self, name: str) -> None:
         """Write the student's weights into a file of the run."""

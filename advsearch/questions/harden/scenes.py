@@ -23,6 +23,7 @@ from advsearch.extend import (
     Model,
     Problem,
     Progress,
+    SceneDescription,
     assets,
     results,
     seeds,
@@ -192,16 +193,17 @@ class SceneJobs:
         # The seed does not depend on the weights: the models before and after the
         # training are attacked in the same way.
         seed = seeds.derive_seed(self.config.seed, f"measured {control}", number)
-        search: dict[str, Any] = {}
-        if steps_factor > 1:
-            # Its policies do not all use gradients, which a hardened model may mask.
-            search = {
-                "policy": STRONGER_POLICY,
-                "steps": steps_factor * self.config.steps,
-            }
+        search = self._make_search_settings(steps_factor)
         config = self.make_attack_config((control,), name, seed=seed, **search)
         model = self.model if weights is None else self.with_weights(weights)
         return attack_scene(config, scene, model)
+
+    def _make_search_settings(self, steps_factor: int) -> dict[str, Any]:
+        """Return the settings that the stronger search changes; none for the usual one."""
+        if steps_factor <= 1:
+            return {}
+        # Its policies do not all use gradients, which a hardened model may mask.
+        return {"policy": STRONGER_POLICY, "steps": steps_factor * self.config.steps}
 
     def evaluate_plain_images(
         self, *, number: int, weights: bytes
@@ -229,10 +231,7 @@ class SceneJobs:
             # models.
             seed = seeds.derive_seed(split.seed, "plain", number * CLEAN_VIEWS + view)
             for when, evaluation in _evaluate_start(problem, seed, models).items():
-                evaluations.setdefault(when, []).append(evaluation.right)
-                if not evaluation.right and evaluation.outcome is not None:
-                    outcomes = evaluations.setdefault(f"outcomes {when}", [])
-                    outcomes.append(evaluation.outcome.value)
+                _add_evaluation(evaluations, when, evaluation)
         return evaluations
 
     def with_weights(self, weights: bytes) -> Model:
@@ -326,19 +325,32 @@ class SceneJobs:
         )
         if split.name != HELD_OUT:
             check_not_held_out(scene.description.object, self._held_out_fingerprints)
-        used_kinds = {_get_kind(control) for control in (*controls, *varying_controls)}
-        random_ranges = {
-            kind: ranges
-            for kind, ranges in RANDOM_RANGES.items()
-            if kind not in used_kinds
-        }
-        for control in varying_controls:
-            random_ranges[control] = self.config.controls[control]
+        random_ranges = self._make_random_ranges(controls, varying_controls)
         config = self.make_attack_config(controls, name, over=random_ranges)
         problem = workbench.make_problem_on(
             config, scene, self.model, differentiated=False
         )
         return problem, seeds.derive_seed(split.seed, "views", number)
+
+    def _make_random_ranges(
+        self, controls: Sequence[str], varying_controls: Sequence[str]
+    ) -> dict[str, Any]:
+        """Return the ranges of all controls that vary at random, by their names.
+
+        Args:
+            controls: controls that are searched.
+            varying_controls: controls of the run that vary at random at the same time.
+        """
+        used_kinds = {_get_kind(control) for control in (*controls, *varying_controls)}
+        unused_ranges = {
+            kind: ranges
+            for kind, ranges in RANDOM_RANGES.items()
+            if kind not in used_kinds
+        }
+        run_ranges = {
+            control: self.config.controls[control] for control in varying_controls
+        }
+        return {**unused_ranges, **run_ranges}
 
     def make_attack_config(
         self, controls: Sequence[str], name: str, **changes: object
@@ -388,16 +400,44 @@ class SceneJobs:
             run_settings = workbench.select_run_settings(
                 self.config, control, control_settings
             )
-            used_settings = {
-                name: value for name, value in run_settings.items() if value is not None
-            }
-            # Settings that no control takes get the value None. Entries of a setting that
-            # is a mapping by control, such as `epsilon`, are merged.
-            none_by_name = dict.fromkeys(run_settings)
-            selected = settings.merge_mappings(
-                {**none_by_name, **selected}, used_settings
-            )
+            selected = _add_used_settings(selected, run_settings)
         return selected
+
+
+def _add_used_settings(
+    selected: Mapping[str, Any], run_settings: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return selected settings together with those that a control takes.
+
+    Settings that no control takes get the value None. Entries of a setting that is a
+    mapping by control, such as `epsilon`, are merged.
+
+    Args:
+        selected: settings that other controls take.
+        run_settings: all such settings of the run; None if the control does not take
+            one.
+    """
+    used_settings = {
+        name: value for name, value in run_settings.items() if value is not None
+    }
+    none_by_name = dict.fromkeys(run_settings)
+    return settings.merge_mappings({**none_by_name, **selected}, used_settings)
+
+
+def _add_evaluation(
+    evaluations: dict[str, list[Any]], when: str, evaluation: Any
+) -> None:
+    """Add the evaluation of an image to those that `evaluate_plain_images` returns.
+
+    Args:
+        evaluations: what has been evaluated so far, which is changed.
+        when: "before" or "after".
+        evaluation: evaluation of the prediction of the image.
+    """
+    evaluations.setdefault(when, []).append(evaluation.right)
+    if not evaluation.right and evaluation.outcome is not None:
+        outcomes = evaluations.setdefault(f"outcomes {when}", [])
+        outcomes.append(evaluation.outcome.value)
 
 
 def _evaluate_start(
@@ -509,21 +549,30 @@ class SceneSplit:
         # Each scene has its own generator, so that it does not depend on the order in
         # which scenes are loaded.
         rng = self.make_generator(number)
-        asset = OBJECTS[name].generate(rng) if name in OBJECTS else Path(name)
-        environment = self.environments[int(rng.integers(len(self.environments)))]
-        scene_settings = {**_sample_scene_settings(rng), **(fixed_settings or {})}
-        scene = workbench.load_scene(asset, environment, settings=scene_settings)
+        scene = self._load_random_scene(name, rng, fixed_settings or {})
         description = scene.description
         if self.varied and description.environment is not None:
             light = vary_environment(description.environment, rng)
             light = change_white_light(light, rng)
             description = replace(description, environment=light)
-        if description.object.label is None:
-            label = Path(name).stem.replace("-", " ").replace("_", " ")
-            labelled_object = replace(description.object, label=label)
-            description = replace(description, object=labelled_object)
+        description = _label_object(description, name)
         is_changed = description is not scene.description
         return name, workbench.Scene(description) if is_changed else scene
+
+    def _load_random_scene(
+        self, name: str, rng: np.random.Generator, fixed_settings: Mapping[str, Any]
+    ) -> workbench.Scene:
+        """Load a random instance of an object in a random environment of the split.
+
+        Args:
+            name: name of a bundled object, or a file.
+            rng: random generator of the scene.
+            fixed_settings: values of scene parameters that override sampled ones.
+        """
+        asset = OBJECTS[name].generate(rng) if name in OBJECTS else Path(name)
+        environment = self.environments[int(rng.integers(len(self.environments)))]
+        scene_settings = {**_sample_scene_settings(rng), **fixed_settings}
+        return workbench.load_scene(asset, environment, settings=scene_settings)
 
     def _get_object_name(self, number: int) -> str:
         """Return the name of the object of a scene: the objects take turns."""
@@ -550,6 +599,19 @@ class SceneSplit:
             elif is_first_time:
                 _, scene = self.load_scene(number)
                 yield scene.description.object
+
+
+def _label_object(description: SceneDescription, file: str) -> SceneDescription:
+    """Return a description whose object has a label: without one, that of its file."""
+    if description.object.label is not None:
+        return description
+    labelled_object = replace(description.object, label=_name_class(file))
+    return replace(description, object=labelled_object)
+
+
+def _name_class(file: str) -> str:
+    """Return the class that a file is named after: "coffee mug" of "coffee-mug.glb"."""
+    return Path(file).stem.replace("-", " ").replace("_", " ")
 
 
 def _get_kind(control: str) -> str:
@@ -582,13 +644,7 @@ def make_splits(config: HardenConfig, model: Model) -> dict[str, SceneSplit]:
             from a file and no held-out objects are named.
     """
     objects = _select_objects(config, model)
-    # A bundled object has random instances, a file only one.
-    files = [name for name in objects if name not in OBJECTS]
-    if files and config.held_out is None:
-        raise InputError(
-            f"held_out: {', '.join(files)} has no other instances; name other objects "
-            "of its class, which are not trained on"
-        )
+    _check_other_instances(config, objects)
     training_environments = _environments(config.environment, "train")
     splits = {
         name: SceneSplit(
@@ -600,17 +656,41 @@ def make_splits(config: HardenConfig, model: Model) -> dict[str, SceneSplit]:
         )
         for name in (TRAINING, FURTHER, VALIDATION)
     }
-    # Without the setting, the held-out split has other instances of the same objects.
-    held_out_objects = objects
+    splits[HELD_OUT] = _make_held_out_split(config, objects)
+    return splits
+
+
+def _check_other_instances(config: HardenConfig, objects: Sequence[str]) -> None:
+    """Check that there are other objects than those of the training to measure with.
+
+    Raises:
+        InputError: an object comes from a file and no held-out objects are named.
+    """
+    # A bundled object has random instances, a file only one.
+    files = [name for name in objects if name not in OBJECTS]
+    if files and config.held_out is None:
+        raise InputError(
+            f"held_out: {', '.join(files)} has no other instances; name other objects "
+            "of its class, which are not trained on"
+        )
+
+
+def _make_held_out_split(
+    config: HardenConfig, training_objects: tuple[str, ...]
+) -> SceneSplit:
+    """Return the split that is measured.
+
+    Without the setting `held_out`, it has other instances of the same objects.
+    """
+    held_out_objects = training_objects
     if config.held_out is not None:
         held_out_objects = settings.split_names(config.held_out)
-    splits[HELD_OUT] = SceneSplit(
+    return SceneSplit(
         HELD_OUT,
         held_out_objects,
         _environments(config.held_out_environment, "heldout"),
         seed=seeds.derive_seed(config.seed, HELD_OUT),
     )
-    return splits
 
 
 def _select_objects(config: HardenConfig, model: Model) -> tuple[str, ...]:
@@ -671,6 +751,25 @@ def check_disjoint(held_out: SceneSplit, training_splits: Sequence[SceneSplit]) 
     Raises:
         InputError: an environment or a file is in both.
     """
+    _check_disjoint_environments(held_out, training_splits)
+    # Objects take turns, so that the first scenes have one instance of each.
+    held_out_fingerprints = {
+        compute_fingerprint(asset)
+        for asset in held_out.generate_objects(len(held_out.objects))
+    }
+    for split in training_splits:
+        for asset in split.generate_objects(len(split.objects)):
+            check_not_held_out(asset, held_out_fingerprints)
+
+
+def _check_disjoint_environments(
+    held_out: SceneSplit, training_splits: Sequence[SceneSplit]
+) -> None:
+    """Check that the training has no environment of the measurement.
+
+    Raises:
+        InputError: an environment is in both.
+    """
     training_environments = {
         name for split in training_splits for name in split.environments
     }
@@ -680,14 +779,6 @@ def check_disjoint(held_out: SceneSplit, training_splits: Sequence[SceneSplit]) 
             f"held_out_environment: {', '.join(common)} is an environment "
             "of the training, too; name other environments"
         )
-    # Objects take turns, so that the first scenes have one instance of each.
-    held_out_fingerprints = {
-        compute_fingerprint(asset)
-        for asset in held_out.generate_objects(len(held_out.objects))
-    }
-    for split in training_splits:
-        for asset in split.generate_objects(len(split.objects)):
-            check_not_held_out(asset, held_out_fingerprints)
 
 
 def check_not_held_out(

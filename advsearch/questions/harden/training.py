@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -153,34 +153,39 @@ class ClassifierTrainer(Trainer):
             split: name of the split.
             scene_numbers: numbers of its scenes.
         """
-        training_views, validation_views = self.n_views
-        jobs = list[Job]()
-        for control, number in itertools.product(
+        controls_and_numbers = itertools.product(
             self.scene_jobs.matrix_controls, scene_numbers
-        ):
-            n_views = validation_views
-            shares_texture = False
-            varies_others = False
-            if split == TRAINING:
-                n_views = training_views
-                shares_texture, varies_others = self.sample_scene_options(
-                    control, number
-                )
-            jobs.append(
-                _make_job(
-                    split,
-                    number,
-                    (control,),
-                    views=n_views,
-                    # one view without a worst image, to keep the clean accuracy
-                    plain=1,
-                    shared=shares_texture,
-                    varying_controls=(
-                        self.scene_jobs.random_controls if varies_others else ()
-                    ),
-                )
-            )
-        return jobs
+        )
+        return [
+            self._make_matrix_job(split, control, number)
+            for control, number in controls_and_numbers
+        ]
+
+    def _make_matrix_job(self, split: str, control: str, number: int) -> Job:
+        """Return the job that makes the lessons of a scene for one control.
+
+        Args:
+            split: name of the split.
+            control: control whose images a matrix of light transport predicts.
+            number: number of the scene.
+        """
+        training_views, validation_views = self.n_views
+        n_views = validation_views
+        shares_texture = False
+        varies_others = False
+        if split == TRAINING:
+            n_views = training_views
+            shares_texture, varies_others = self.sample_scene_options(control, number)
+        return _make_job(
+            split,
+            number,
+            (control,),
+            views=n_views,
+            # one view without a worst image, to keep the clean accuracy
+            plain=1,
+            shared=shares_texture,
+            varying_controls=self.scene_jobs.random_controls if varies_others else (),
+        )
 
     def _rendered_jobs(self, split: str, scene_numbers: range) -> list[Job]:
         """Return the jobs that make lessons by rendering, one for each scene.
@@ -268,19 +273,21 @@ class ClassifierTrainer(Trainer):
             gradients = GradientComputer(
                 self.student, original_model=self.scene_jobs.model, pool=pool
             )
+            yield partial(self._compute_batch_gradient, gradients)
 
-            def compute_gradient(
-                batch: Sequence[Lesson], rng: np.random.Generator
-            ) -> None:
-                """Compute the gradient of a batch of lessons, and store it in `grad`.
+    def _compute_batch_gradient(
+        self,
+        gradients: GradientComputer,
+        batch: Sequence[Lesson],
+        rng: np.random.Generator,
+    ) -> None:
+        """Compute the gradient of a batch of lessons, and store it in `grad`.
 
-                The user's next batch of examples is added, if there are any.
-                """
-                examples = self.next_examples()
-                seed = int(rng.integers(2**62))  # fits an int64
-                gradients.compute(batch, examples, seed)
-
-            yield compute_gradient
+        The user's next batch of examples is added, if there are any.
+        """
+        examples = self.next_examples()
+        seed = int(rng.integers(2**62))  # fits an int64
+        gradients.compute(batch, examples, seed)
 
     def next_examples(self) -> tuple[Tensor, Tensor] | None:
         """Return the next batch of the user's examples; None if there are none.
@@ -367,11 +374,19 @@ def _accuracy(
             batch = selected[start : start + lessons.BATCH_SIZE]
             logits = model(torch.stack([get_image(lesson) for lesson in batch]))
             predicted = logits.argmax(dim=1).tolist()
-            n_right += sum(
-                index in lesson.right_classes
-                for index, lesson in zip(predicted, batch, strict=True)
-            )
+            right_classes = [lesson.right_classes for lesson in batch]
+            n_right += sum(_compare_classes(predicted, right_classes))
     return n_right / len(selected)
+
+
+def _compare_classes(
+    predicted: Sequence[int], right_classes: Sequence[tuple[int, ...]]
+) -> list[bool]:
+    """Return whether each predicted class is one of the right ones of its image."""
+    return [
+        index in classes
+        for index, classes in zip(predicted, right_classes, strict=True)
+    ]
 
 
 class GradientComputer:
@@ -414,35 +429,56 @@ class GradientComputer:
                 None.
             seed: seed of the augmentation.
         """
-        # Textures come first. So the parts of the search below, which has textures only,
-        # and those of the loss have the same textures, and augment them equally.
-        textures = [lesson for lesson in batch if isinstance(lesson, TextureLesson)]
-        others = [lesson for lesson in batch if not isinstance(lesson, TextureLesson)]
-        batch = [*textures, *others]
+        batch = _put_textures_first(batch)
         self._ascend_textures(batch, seed)
-
-        # The loss is a mean over plain images plus a mean over worst images. A part has
-        # a sum of losses, weighted by the counts of the full batch. So the sum of the
-        # parts' gradients is the gradient of the means.
-        plain_weight = 1.0 / len(batch)
-        worst_weight = 1.0 / max(1, len(select_hard_lessons(batch)))
-
-        def compute_part_gradient(
-            part: Sequence[Lesson], twin: Trainable, part_seed: int
-        ) -> Sequence[Tensor | None]:
-            """Return the gradient of the loss of a part by each parameter."""
-            loss = self._loss(twin, part, plain_weight, worst_weight, part_seed)
-            return torch.autograd.grad(loss, twin.parameters(), allow_unused=True)
-
-        gradients = self._map_parts(compute_part_gradient, batch, seed)
+        gradients = self._map_parts(self._make_part_gradient(batch), batch, seed)
         if further_batch is not None:
             gradients.append(self._compute_further_gradient(*further_batch))
         for parameter, *part_gradients in zip(
             self._student.parameters(), *gradients, strict=True
         ):
-            # None: the part's loss does not depend on the parameter
-            used = [gradient for gradient in part_gradients if gradient is not None]
-            parameter.grad = torch.stack(used).sum(dim=0) if used else None
+            parameter.grad = _sum_gradients(part_gradients)
+
+    def _make_part_gradient(
+        self, batch: Sequence[Lesson]
+    ) -> Callable[..., Sequence[Tensor | None]]:
+        """Return the function that computes the gradient of the loss of a part.
+
+        The loss is a mean over plain images plus a mean over worst images. A part has
+        a sum of losses, weighted by the counts of the full batch. So the sum of the
+        parts' gradients is the gradient of the means.
+
+        Args:
+            batch: the full batch.
+        """
+        plain_weight = 1.0 / len(batch)
+        worst_weight = 1.0 / max(1, len(select_hard_lessons(batch)))
+        return partial(
+            self._compute_part_gradient,
+            plain_weight=plain_weight,
+            worst_weight=worst_weight,
+        )
+
+    def _compute_part_gradient(
+        self,
+        part: Sequence[Lesson],
+        twin: Trainable,
+        part_seed: int,
+        *,
+        plain_weight: float,
+        worst_weight: float,
+    ) -> Sequence[Tensor | None]:
+        """Return the gradient of the loss of a part by each parameter.
+
+        Args:
+            part: the lessons, textures first.
+            twin: the part's copy of the network.
+            part_seed: seed of the augmentation.
+            plain_weight: weight of each plain image.
+            worst_weight: weight of each worst image.
+        """
+        loss = self._loss(twin, part, plain_weight, worst_weight, part_seed)
+        return torch.autograd.grad(loss, twin.parameters(), allow_unused=True)
 
     def _ascend_textures(self, batch: Sequence[Lesson], seed: int) -> None:
         """Take a step of the search for worse textures, on augmented images.
@@ -450,23 +486,16 @@ class GradientComputer:
         The textures are changed in place. Gradients are computed in parts on threads,
         each with its own copy of the network (`twin`).
         """
+        lessons.ascend_textures(
+            batch, partial(self._compute_texture_gradients, seed=seed)
+        )
 
-        def compute_part_gradients(
-            part: Sequence[TextureLesson], twin: Trainable, part_seed: int
-        ) -> Sequence[Tensor]:
-            """Return the gradient (d,) of the loss by the texture of each lesson."""
-            return lessons.compute_texture_gradients(
-                part, twin.evaluation_logits, lambda images: _augment(images, part_seed)
-            )
-
-        def compute_gradients(
-            texture_lessons: Sequence[TextureLesson],
-        ) -> list[Tensor]:
-            """Return the gradients of all lessons, part by part on the threads."""
-            parts = self._map_parts(compute_part_gradients, texture_lessons, seed)
-            return list(itertools.chain.from_iterable(parts))
-
-        lessons.ascend_textures(batch, compute_gradients)
+    def _compute_texture_gradients(
+        self, texture_lessons: Sequence[TextureLesson], seed: int
+    ) -> list[Tensor]:
+        """Return the gradients of all lessons, part by part on the threads."""
+        parts = self._map_parts(_compute_gradients_of_part, texture_lessons, seed)
+        return list(itertools.chain.from_iterable(parts))
 
     def _compute_further_gradient(
         self, images: Tensor, labels: Tensor
@@ -518,11 +547,6 @@ class GradientComputer:
     ) -> Tensor:
         """Return the loss of a part of a batch.
 
-        At random, all rendered images of a part are mixed with each other (mixup, Zhang
-        et al. 2018, arXiv 1710.09412). Rendered images stay the same in all epochs, so
-        that the network could memorize them. Textures need no mixing, as they change in
-        each step.
-
         Args:
             student: the network that is trained.
             part: the lessons, textures first.
@@ -534,33 +558,22 @@ class GradientComputer:
         lesson_of_image: list[Lesson] = [*part, *select_hard_lessons(part)]
         right_classes = [lesson.right_classes for lesson in lesson_of_image]
         images = _augment_images(part, seed)
-        mixed, partners, partner_weight = _mix_images(images, lesson_of_image, seed)
+        mixing = _mix_images(images, lesson_of_image, seed)
         logits = student.logits(images)
-        losses = negative_log_likelihood(logits, right_classes)
-        if mixed:
-            # A mixed image has the classes of both images, weighted as its pixels are.
-            partner_losses = negative_log_likelihood(
-                logits[mixed], [right_classes[index] for index in partners]
-            )
-            losses[mixed] = torch.lerp(losses[mixed], partner_losses, partner_weight)
-        loss = (
-            plain_weight * losses[: len(part)].sum()
-            + worst_weight * losses[len(part) :].sum()
-        )
-        # The student stays near the original model's predictions on plain images. A
-        # `RenderedLesson` is left out: a control has changed even in its plain image,
-        # and the original model, even if it is right, may be unsure about it. (These
-        # images are also the mixed ones.) The index of a lesson is that of its plain
-        # image, as plain images come first.
+        losses = _compute_mixed_losses(logits, right_classes, mixing)
+        plain_loss = losses[: len(part)].sum()
+        worst_loss = losses[len(part) :].sum()
+        loss = plain_weight * plain_loss + worst_weight * worst_loss
         unrendered = _find_unrendered(part)
-        if unrendered:
-            divergence = self._divergence_from_original(
-                images[unrendered],
-                logits[unrendered],
-                [right_classes[index] for index in unrendered],
-            )
-            loss = loss + plain_weight * ORIGINAL_MODEL_WEIGHT * divergence
-        return loss
+        if not unrendered:
+            return loss
+        # The student should predict these images as the original model does.
+        divergence = self._divergence_from_original(
+            images[unrendered],
+            logits[unrendered],
+            right=[right_classes[index] for index in unrendered],
+        )
+        return loss + plain_weight * ORIGINAL_MODEL_WEIGHT * divergence
 
     def _divergence_from_original(
         self, images: Tensor, logits: Tensor, right: Sequence[tuple[int, ...]]
@@ -577,9 +590,7 @@ class GradientComputer:
         with torch.no_grad():
             original_logits = self._original_model(images)
         predicted = original_logits.argmax(dim=1).tolist()
-        is_right = [
-            index in classes for index, classes in zip(predicted, right, strict=True)
-        ]
+        is_right = _compare_classes(predicted, right)
         return F.kl_div(
             F.log_softmax(logits[is_right], dim=1),
             F.log_softmax(original_logits[is_right], dim=1),
@@ -588,30 +599,75 @@ class GradientComputer:
         )
 
 
+def _sum_gradients(part_gradients: Sequence[Tensor | None]) -> Tensor | None:
+    """Return the sum of the gradients of a parameter; None if no part has one.
+
+    A part whose loss does not depend on the parameter has None.
+    """
+    used = [gradient for gradient in part_gradients if gradient is not None]
+    return torch.stack(used).sum(dim=0) if used else None
+
+
+def _put_textures_first(batch: Sequence[Lesson]) -> list[Lesson]:
+    """Return a batch with the lessons that have textures first.
+
+    So the parts of the search, which has textures only, and those of the loss have the
+    same textures, and augment them equally.
+    """
+    textures = [lesson for lesson in batch if isinstance(lesson, TextureLesson)]
+    others = [lesson for lesson in batch if not isinstance(lesson, TextureLesson)]
+    return [*textures, *others]
+
+
+def _compute_gradients_of_part(
+    part: Sequence[TextureLesson], twin: Trainable, part_seed: int
+) -> Sequence[Tensor]:
+    """Return the gradient (d,) of the loss by the texture of each lesson of a part.
+
+    Args:
+        part: the lessons.
+        twin: the part's copy of the network.
+        part_seed: seed of the augmentation.
+    """
+    return lessons.compute_texture_gradients(
+        part, twin.evaluation_logits, lambda images: _augment(images, part_seed)
+    )
+
+
+class _Mixing(NamedTuple):
+    """How rendered images of a part were mixed with each other (mixup).
+
+    Attributes:
+        mixed: indices of the images that are mixed; none unless the part is mixed
+            (`MIXUP_PROBABILITY`).
+        partners: index of the partner of each.
+        partner_weight: the weight of the partner, at most 1/2.
+    """
+
+    mixed: list[int]
+    partners: list[int]
+    partner_weight: float
+
+
 def _mix_images(
     images: Tensor, lesson_of_image: Sequence[Lesson], seed: int
-) -> tuple[list[int], list[int], float]:
+) -> _Mixing:
     """Mix rendered images with each other in place, at random (mixup).
+
+    Zhang et al. 2018, arXiv 1710.09412. Rendered images stay the same in all epochs, so
+    that the network could memorize them. Textures need no mixing, as they change in
+    each step.
 
     Args:
         images: (N, H, W, 3), which are changed.
         lesson_of_image: the lesson that each image belongs to (N,).
         seed: seed of the choice whether they are mixed, of the partners and of the
             weight.
-
-    Returns:
-        The indices of the images that are mixed, which are none unless the part is mixed
-        (`MIXUP_PROBABILITY`); the index of the partner of each; and the weight of the
-        partner, at most 1/2.
     """
     rng = np.random.default_rng(seed)
     mixed = list[int]()
     if rng.random() < MIXUP_PROBABILITY:
-        mixed = [
-            index
-            for index, lesson in enumerate(lesson_of_image)
-            if isinstance(lesson, RenderedLesson)
-        ]
+        mixed = _find_rendered(lesson_of_image)
     partners = rng.permutation(mixed).astype(int).tolist()
     sampled_weight = float(rng.beta(MIXUP_BETA, MIXUP_BETA))
     # At most 1/2, so that the image itself always has the larger weight.
@@ -619,11 +675,48 @@ def _mix_images(
     if mixed:
         # Both operands are copies, so that every partner is an image before the mixing.
         images[mixed] = torch.lerp(images[mixed], images[partners], partner_weight)
-    return mixed, partners, partner_weight
+    return _Mixing(mixed, partners, partner_weight)
+
+
+def _compute_mixed_losses(
+    logits: Tensor, right_classes: Sequence[tuple[int, ...]], mixing: _Mixing
+) -> Tensor:
+    """Return the negative log-likelihood (N,) of images, some of which are mixed.
+
+    A mixed image has the classes of both images, weighted as its pixels are.
+
+    Args:
+        logits: the student's logits (N, classes).
+        right_classes: indices of the right classes of each image before the mixing.
+        mixing: how the images were mixed.
+    """
+    losses = negative_log_likelihood(logits, right_classes)
+    mixed = mixing.mixed
+    if mixed:
+        partner_losses = negative_log_likelihood(
+            logits[mixed], [right_classes[index] for index in mixing.partners]
+        )
+        losses[mixed] = torch.lerp(losses[mixed], partner_losses, mixing.partner_weight)
+    return losses
+
+
+def _find_rendered(lesson_of_image: Sequence[Lesson]) -> list[int]:
+    """Return the indices of the images whose lesson is a `RenderedLesson`."""
+    return [
+        index
+        for index, lesson in enumerate(lesson_of_image)
+        if isinstance(lesson, RenderedLesson)
+    ]
 
 
 def _find_unrendered(part: Sequence[Lesson]) -> list[int]:
-    """Return the indices of the lessons that are no `RenderedLesson`."""
+    """Return the indices of the lessons that are no `RenderedLesson`.
+
+    On their plain images, the student stays near the original model's predictions. In a
+    `RenderedLesson` a control has changed even in the plain image, and the original
+    model, even if it is right, may be unsure about it. (These images are also the mixed
+    ones.) The index of a lesson is that of its plain image, as plain images come first.
+    """
     return [
         index
         for index, lesson in enumerate(part)

@@ -8,7 +8,7 @@ body and cabin. Numbers without an explanation are measures of the car in metres
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from itertools import pairwise, product
 
 import numpy as np
@@ -106,21 +106,29 @@ def _shell(
     patches = []
     for first, last in pairwise(chart_bounds):
         columns = np.s_[:, first : last + 1]
-        length_to_column = shapes.mean_lengths(points[columns], axis=1)
-        length_to_row = shapes.mean_lengths(points[columns], axis=0)
-        width = float(length_to_column[-1])
-        height_of_chart = float(length_to_row[-1])
-        patches.append(
-            shapes.make_grid_patch(
-                "paint",
-                points[columns],
-                normals[columns],
-                size=(width, height_of_chart),
-                down=length_to_row / height_of_chart,
-                across=length_to_column / width,
-            )
-        )
+        patches.append(_make_shell_patch(points[columns], normals[columns]))
     return patches
+
+
+def _make_shell_patch(points: Array, normals: Array) -> Patch:
+    """Create the painted patch of some columns of a shell.
+
+    Args:
+        points: (R, C, 3), from bottom to top and from column to column.
+        normals: (R, C, 3).
+    """
+    length_to_column = shapes.mean_lengths(points, axis=1)
+    length_to_row = shapes.mean_lengths(points, axis=0)
+    width = float(length_to_column[-1])
+    height = float(length_to_row[-1])
+    return shapes.make_grid_patch(
+        "paint",
+        points,
+        normals,
+        size=(width, height),
+        down=length_to_row / height,
+        across=length_to_column / width,
+    )
 
 
 def _outline_angles(levels: Array, power: float, center_x: float) -> Array:
@@ -293,19 +301,30 @@ def _compute_depths_inside(points: Array) -> dict[str, Array]:
     """
     x, y, z = points.T
     abs_y = np.abs(y)
-    headlight = _inside_headlight(abs_y, x, z)
-    taillight = _soft_minimum(abs_y - 0.40, -1.80 - x, z - 0.785, 0.955 - z)
     # the height of the dark lower edge (the valance), which is larger at the rear
     valance_height = np.where(x < -1.6, 0.13, 0.075)
     return {
         "cabin": 0.72 * (1.0 - _cabin_radius(x, y)),
         "front arch": _inside_arch(AXLES[0], abs_y, x, z),
         "rear arch": _inside_arch(AXLES[1], abs_y, x, z),
-        "headlight": np.where(x > 1.2, headlight, OUTSIDE),
-        "taillight": np.where(x < -1.0, taillight, OUTSIDE),
+        **_inside_lights(abs_y, x, z),
         **_inside_grilles(abs_y, x, z),
         "valance": _bottom_z(x) + valance_height - z,
         **_inside_windows(abs_y, x, z),
+    }
+
+
+def _inside_lights(abs_y: Array, x: Array, z: Array) -> dict[str, Array]:
+    """Return how far points lie inside the headlights and the taillights.
+
+    Args:
+        abs_y, x, z: coordinates of the points (N,); y without its sign.
+    """
+    headlight = _inside_headlight(abs_y, x, z)
+    taillight = _soft_minimum(abs_y - 0.40, -1.80 - x, z - 0.785, 0.955 - z)
+    return {
+        "headlight": np.where(x > 1.2, headlight, OUTSIDE),
+        "taillight": np.where(x < -1.0, taillight, OUTSIDE),
     }
 
 
@@ -345,18 +364,7 @@ def _inside_windows(abs_y: Array, x: Array, z: Array) -> dict[str, Array]:
     # Each argument of `_soft_minimum` is the distance to one edge, positive inside.
     windscreen = _soft_minimum(0.85 * half_width - abs_y, 1.36 - z)
     rear_window = _soft_minimum(0.86 * half_width - abs_y, z - 1.045, 1.325 - z)
-
-    # The side windows lie between two heights and two slanted pillars.
-    lower_edge = _waist_z(x) + 0.04
-    upper_edge = lower_edge + 0.83 * (_roof_z(x) - lower_edge)
-    # The pillars are lines in the x-z plane, through (0.6, 0.93) and (-1.62, 0.98). The
-    # distance of a point is its product with the normal, which points to the windows:
-    # (-0.58, -0.81) and (0.72, -0.69).
-    behind_front_pillar = (0.60 - x) * 0.58 - (z - 0.93) * 0.81
-    before_rear_pillar = (x + 1.62) * 0.72 - (z - 0.98) * 0.69
-    side_windows = _soft_minimum(
-        behind_front_pillar, before_rear_pillar, z - lower_edge, upper_edge - z
-    )
+    side_windows = _inside_side_windows(x, z)
 
     is_front = x > 0.0
     is_rear = x < -1.5
@@ -366,6 +374,23 @@ def _inside_windows(abs_y: Array, x: Array, z: Array) -> dict[str, Array]:
         "rear window": np.where(is_rear, rear_window, OUTSIDE),
         "side windows": np.where(is_side, side_windows, OUTSIDE),
     }
+
+
+def _inside_side_windows(x: Array, z: Array) -> Array:
+    """Return how far points lie inside the outline of the side windows.
+
+    They lie between two heights and two slanted pillars. Arguments and result are (N,).
+    """
+    lower_edge = _waist_z(x) + 0.04
+    upper_edge = lower_edge + 0.83 * (_roof_z(x) - lower_edge)
+    # The pillars are lines in the x-z plane, through (0.6, 0.93) and (-1.62, 0.98). The
+    # distance of a point is its product with the normal, which points to the windows:
+    # (-0.58, -0.81) and (0.72, -0.69).
+    behind_front_pillar = (0.60 - x) * 0.58 - (z - 0.93) * 0.81
+    before_rear_pillar = (x + 1.62) * 0.72 - (z - 0.98) * 0.69
+    return _soft_minimum(
+        behind_front_pillar, before_rear_pillar, z - lower_edge, upper_edge - z
+    )
 
 
 def _inside_headlight(abs_y: Array, x: Array, z: Array) -> Array:
@@ -425,43 +450,47 @@ def _make_opening_field(name: str) -> shapes.Field:
 
 
 def _body_and_cabin() -> list[Patch]:
-    """Create the body and the cabin with their openings.
+    """Create the body and the cabin with their openings."""
+    body = _carve_openings(_body_shell(), OPENINGS["body"])
+    cabin = _carve_openings(_cabin_shell(), OPENINGS["cabin"])
+    return body + cabin
 
-    A level is (fraction of the height, half the width, x of the front end, x of the rear
-    end), in metres.
+
+def _body_shell() -> list[Patch]:
+    """Create the body without openings.
+
+    At its top is the last outline, scaled about the center, at the full height. It keeps
+    a hole, which is under the cabin.
     """
-    # The top of body and cabin: the last outline, scaled about the center, at the full
-    # height. The body keeps a hole, which is under the cabin.
-    _, body_half_width, body_front, body_rear = _BODY[-1]
+    _, half_width, front, rear = _BODY[-1]
     deck = [
-        (1.0, scale * body_half_width, scale * body_front, scale * body_rear)
+        (1.0, scale * half_width, scale * front, scale * rear)
         for scale in (0.92, 0.81, 0.69, 0.56, 0.43)
     ]
+    levels = np.array([*shapes.sample_spline(_BODY, count=23), *deck])
+    return _shell(levels, _BODY_POWER, center_x=0.0, height=_body_height, corner=0.085)
+
+
+def _cabin_shell() -> list[Patch]:
+    """Create the cabin without openings; its roof is the last outline made smaller."""
     # The last outline of the cabin reaches from 0.28 m before its middle to 0.8 m behind.
     roof = [
         (1.0, scale * 0.5, CABIN_X + scale * 0.28, CABIN_X - scale * 0.8)
         for scale in (0.75, 0.45, 0.15, 0.002)
     ]
-    body_levels = np.array([*shapes.sample_spline(_BODY, count=23), *deck])
-    cabin_levels = np.array([*shapes.sample_spline(_CABIN, count=16), *roof])
-    shells = {
-        "body": _shell(
-            body_levels, _BODY_POWER, center_x=0.0, height=_body_height, corner=0.085
-        ),
-        "cabin": _shell(
-            cabin_levels,
-            _CABIN_POWER,
-            center_x=CABIN_X,
-            height=_cabin_height,
-            corner=0.1,
-        ),
-    }
-    for shell_name, tag_of_opening in OPENINGS.items():
-        for opening, tag in tag_of_opening.items():
-            shells[shell_name] = shapes.carve_patches(
-                shells[shell_name], _make_opening_field(opening), tag
-            )
-    return shells["body"] + shells["cabin"]
+    levels = np.array([*shapes.sample_spline(_CABIN, count=16), *roof])
+    return _shell(
+        levels, _CABIN_POWER, center_x=CABIN_X, height=_cabin_height, corner=0.1
+    )
+
+
+def _carve_openings(
+    shell: list[Patch], tag_of_opening: Mapping[str, str | None]
+) -> list[Patch]:
+    """Carve openings out of a shell; see `OPENINGS`."""
+    for opening, tag in tag_of_opening.items():
+        shell = shapes.carve_patches(shell, _make_opening_field(opening), tag)
+    return shell
 
 
 def _wheels() -> list[Patch]:
@@ -491,20 +520,30 @@ def _wheel() -> list[Patch]:
         (RIM - 0.02, disc_z),
     ]
     dark_disc = [(RIM - 0.02, disc_z), (0.0, disc_z)]
-    hub = [
-        (0.052, disc_z),
-        (0.05, outer_z - 0.02),
-        (0.03, outer_z - 0.01),
-        (0.0, outer_z - 0.008),
-    ]
-    round_hub = shapes.round_corners(hub, radius=0.008, steps=2)
     return [
         *shapes.revolve_profile([("rubber", _tyre_profile(RIM, outer_z))], columns=28),
         *shapes.revolve_profile([("rim", rim_edge)], columns=28),
         *shapes.revolve_profile([("well", dark_disc)], columns=24),
         *_spokes(outer_z),
-        *shapes.revolve_profile([("rim", round_hub)], columns=20),
+        *_hub(outer_z, disc_z),
     ]
+
+
+def _hub(outer_z: float, disc_z: float) -> list[Patch]:
+    """Create the rounded hub of a wheel.
+
+    Args:
+        outer_z: z of the outer side of the wheel.
+        disc_z: z of the disc that the hub stands on.
+    """
+    corners = [
+        (0.052, disc_z),
+        (0.05, outer_z - 0.02),
+        (0.03, outer_z - 0.01),
+        (0.0, outer_z - 0.008),
+    ]
+    profile = shapes.round_corners(corners, radius=0.008, steps=2)
+    return shapes.revolve_profile([("rim", profile)], columns=20)
 
 
 def _spokes(outer_z: float) -> list[Patch]:
@@ -553,7 +592,12 @@ def _wells() -> list[Patch]:
     patches = []
     for axle_x, side in WHEEL_POSITIONS:
         patches += _well(axle_x, side)
-    # clockwise seen from above, as the floor looks down; -pi is the same point as pi
+    return [*patches, _floor()]
+
+
+def _floor() -> Patch:
+    """Create the flat floor of the car, which looks down."""
+    # clockwise seen from above; -pi is the same point as pi
     angle = np.linspace(np.pi, -np.pi, 41)[:-1]
     x, y = _outline(
         angle,
@@ -563,8 +607,8 @@ def _wells() -> list[Patch]:
         power=_BODY_POWER,
         center_x=0.0,
     )
-    floor = np.stack([x, y, np.full_like(x, 0.2)], axis=1)
-    return [*patches, shapes.make_cap_face("well", floor, np.array([0.0, 0.0, -1.0]))]
+    ring = np.stack([x, y, np.full_like(x, 0.2)], axis=1)
+    return shapes.make_cap_face("well", ring, np.array([0.0, 0.0, -1.0]))
 
 
 def _well(axle: float, side: float) -> list[Patch]:
@@ -587,19 +631,28 @@ def _well(axle: float, side: float) -> list[Patch]:
     if side > 0:
         edges = edges[::-1]
         inner_edge = inner_edge[::-1]
-    curved_wall = shapes.make_grid_patch(
+    return [
+        _curved_well_wall(edges, outwards),
+        shapes.make_cap_face("well", inner_edge, np.array([0.0, side, 0.0])),
+    ]
+
+
+def _curved_well_wall(edges: Array, outwards: Array) -> Patch:
+    """Create the curved wall between two arcs around an axle.
+
+    Args:
+        edges: (2, N, 3) the arcs.
+        outwards: directions (N, 3) from the axle; the wall looks towards the axle.
+    """
+    return shapes.make_grid_patch(
         "well",
         edges,
         np.broadcast_to(-outwards, edges.shape),
         # 4.2 radians are 240 degrees; the chart may be larger than the wall is deep
         size=(ARCH * 4.2, 0.32),
         down=np.array([0.0, 1.0]),
-        across=np.linspace(0.0, 1.0, len(angle)),
+        across=np.linspace(0.0, 1.0, len(outwards)),
     )
-    return [
-        curved_wall,
-        shapes.make_cap_face("well", inner_edge, np.array([0.0, side, 0.0])),
-    ]
 
 
 def _fittings() -> list[Patch]:
@@ -618,25 +671,24 @@ def _fittings() -> list[Patch]:
 
 
 def _mirrors() -> list[Patch]:
-    """Create the two mirrors, each a painted shell on a dark arm."""
-    patches = []
-    for side in (1.0, -1.0):
-        shell = shapes.make_rounded_box(
-            "paint", (0.0, 0.0, 0.0), (0.12, 0.2, 0.125), bevel=0.055, steps=3
-        )
-        patches += shapes.transform_patches(
-            shell,
-            shapes.make_rotation_matrix("z", -14.0 * side),
-            (0.57, side * 0.93, 1.005),
-        )
-        patches += shapes.make_rounded_box(
-            "trim",
-            (0.58, side * 0.83, 0.955),
-            (0.06, 0.14, 0.035),
-            bevel=0.012,
-            steps=1,
-        )
-    return patches
+    """Create the two mirrors."""
+    return [*_mirror(1.0), *_mirror(-1.0)]
+
+
+def _mirror(side: float) -> list[Patch]:
+    """Create a mirror: a painted shell on a dark arm.
+
+    Args:
+        side: 1 at +y, -1 at -y.
+    """
+    shell = shapes.make_rounded_box(
+        "paint", (0.0, 0.0, 0.0), (0.12, 0.2, 0.125), bevel=0.055, steps=3
+    )
+    turn = shapes.make_rotation_matrix("z", -14.0 * side)
+    arm = shapes.make_rounded_box(
+        "trim", (0.58, side * 0.83, 0.955), (0.06, 0.14, 0.035), bevel=0.012, steps=1
+    )
+    return [*shapes.transform_patches(shell, turn, (0.57, side * 0.93, 1.005)), *arm]
 
 
 def _plates_and_badges() -> list[Patch]:
@@ -704,6 +756,12 @@ def _lacquer(t: Texels, color: Array) -> Array:
     return blend_colors(shaded, 0.12 * color, 0.9 * is_gap)
 
 
+_HOOD = [(0.9, 0.74), (1.5, 0.70), (1.84, 0.58), (1.95, 0.3), (1.97, 0.0)]
+"""The gap of the hood as a polyline (x, distance from the middle of the car)."""
+_TAILGATE = [(0.66, 1.2), (0.70, 0.98), (0.62, 0.66), (0.55, 0.58), (0.0, 0.57)]
+"""The gap of the tailgate as a polyline (distance from the middle of the car, z)."""
+
+
 def _gap_distance(t: Texels) -> Array:
     """Return the distance (N,) to the nearest gap of doors, hood, tailgate or tank lid.
 
@@ -712,12 +770,8 @@ def _gap_distance(t: Texels) -> Array:
     x, y, z = t.xyz.T
     abs_y = np.abs(y)
     doors = shapes.distance_to_polylines(x, z, *_DOORS)
-    hood = shapes.distance_to_polylines(
-        x, abs_y, [(0.9, 0.74), (1.5, 0.70), (1.84, 0.58), (1.95, 0.3), (1.97, 0.0)]
-    )
-    tailgate = shapes.distance_to_polylines(
-        abs_y, z, [(0.66, 1.2), (0.70, 0.98), (0.62, 0.66), (0.55, 0.58), (0.0, 0.57)]
-    )
+    hood = shapes.distance_to_polylines(x, abs_y, _HOOD)
+    tailgate = shapes.distance_to_polylines(abs_y, z, _TAILGATE)
     tank_lid = np.abs(np.hypot(x + 1.52, z - 0.80) - 0.075)  # a circle
     gaps = [
         np.where((abs_y > 0.6) & (z < 1.02), doors, FAR),
@@ -736,14 +790,23 @@ def _panes(t: Texels) -> Array:
     glass = blend_colors(
         parse_hex_color("20272b"), parse_hex_color("414d55"), height_fraction
     )
-    backrest = np.hypot((abs_y - 0.36) / 0.24, (z - 1.0) / 0.2)
-    headrest = np.hypot((abs_y - 0.36) / 0.11, (z - 1.23) / 0.055)
-    seat = compute_soft_step(1.0 - np.minimum(backrest, headrest), 0.0, soft=0.15)
     pillar = compute_soft_step(0.035 - np.abs(x + 0.25), 0.0, soft=0.01)
     side_pillar = np.where(abs_y > 0.55, pillar, 0.0)
-    front_seat = np.where(x > 0.0, seat, 0.0)
+    front_seat = np.where(x > 0.0, _seat_mask(abs_y, z), 0.0)
     dark = np.maximum(side_pillar, front_seat)
     return blend_colors(glass, parse_hex_color("0b0c0d"), dark)
+
+
+def _seat_mask(abs_y: Array, z: Array) -> Array:
+    """Return the weight (N,) of the seats in front of a pane: backrests with headrests.
+
+    Args:
+        abs_y: distance from the middle of the car (N,).
+        z: height (N,).
+    """
+    backrest = np.hypot((abs_y - 0.36) / 0.24, (z - 1.0) / 0.2)
+    headrest = np.hypot((abs_y - 0.36) / 0.11, (z - 1.23) / 0.055)
+    return compute_soft_step(1.0 - np.minimum(backrest, headrest), 0.0, soft=0.15)
 
 
 def _lamps(t: Texels) -> Array:
@@ -812,6 +875,12 @@ FINISHES = {
 }
 
 
+TEXEL_DENSITY = {"rubber": 0.3, "well": 0.15, "rim": 0.35, "trim": 0.7, "plate": 3.0}
+"""Texels per length, relative to the paint: fewer for parts that are hardly visible, more
+for the signs on the plate.
+"""
+
+
 # built in metres; the texture is 384 texels wide
 @make_family(unit_in_metres=1.0, texels=384)
 def car(sampler: ParameterSampler) -> Instance:
@@ -831,8 +900,25 @@ def car(sampler: ParameterSampler) -> Instance:
         ]
     )
     patches = [*_body_and_cabin(), *_wheels(), *_wells(), *_fittings()]
+    return Instance(
+        shapes.stretch_patches(patches, stretch),
+        _sample_paints(sampler, color),
+        material=FINISHES["paint"],  # the main one of `materials_by_tag`
+        texel_density=TEXEL_DENSITY,
+        materials_by_tag=FINISHES,
+        drives=True,  # it can move along a path as a vehicle does
+    )
+
+
+def _sample_paints(sampler: ParameterSampler, color: Array) -> dict[str, Paint]:
+    """Sample the paints of a car by the tags of its patches.
+
+    Args:
+        sampler: samples the colors of the rims and of the plates.
+        color: color (3,) of the lacquer.
+    """
     metal = sampler.sample_color("c4c7ca", "8d9094", "2d2f31", p_random=0.0)
-    paints: dict[str, Paint] = {
+    return {
         "paint": _lacquer(color),
         "glass": _panes,
         "headlight": _lamps,
@@ -843,19 +929,3 @@ def car(sampler: ParameterSampler) -> Instance:
         "plate": _plate(sampler.sample_color("f2f2ec", "f0d264", p_random=0.0)),
         "well": paint_solid_color("0a0a0b"),
     }
-    return Instance(
-        shapes.stretch_patches(patches, stretch),
-        paints,
-        material=FINISHES["paint"],  # the main one of `materials_by_tag`
-        # texels per length, relative to the paint: fewer for parts that are hardly
-        # visible, more for the signs on the plate
-        texel_density={
-            "rubber": 0.3,
-            "well": 0.15,
-            "rim": 0.35,
-            "trim": 0.7,
-            "plate": 3.0,
-        },
-        materials_by_tag=FINISHES,
-        drives=True,  # it can move along a path as a vehicle does
-    )

@@ -74,33 +74,52 @@ def _shelves(
     texel_sizes = [
         (_to_texels(width, scale), _to_texels(height, scale)) for width, height in sizes
     ]
-    # by decreasing height, then width; equal rectangles stay in their order
-    highest_first = sorted(
-        range(len(sizes)),
-        key=lambda index: (-texel_sizes[index][1], -texel_sizes[index][0], index),
-    )
     rectangles: dict[int, AtlasRectangle] = {}
     shelves: list[_Shelf] = []
-    top = 0
-    for index in highest_first:
+    for index in _sort_highest_first(texel_sizes):
         width, height = texel_sizes[index]
-        if width > side:
-            return None
-        # Every shelf is high enough, as the highest rectangles come first.
-        fitting_shelves = [shelf for shelf in shelves if shelf.filled + width <= side]
-        if fitting_shelves:
-            shelf = fitting_shelves[0]
-        elif top + height <= side:
-            shelf = _Shelf(bottom=top, height=height, filled=0)
-            shelves.append(shelf)
-            top += height
-        else:
+        shelf = _find_shelf(shelves, width, height, side)
+        if shelf is None:
             return None
         rectangles[index] = AtlasRectangle(
             x=shelf.filled, y=shelf.bottom, width=width, height=height, is_rotated=False
         )
         shelf.filled += width
     return [rectangles[index] for index in range(len(sizes))]
+
+
+def _sort_highest_first(sizes: Sequence[tuple[int, int]]) -> list[int]:
+    """Return the indices of rectangles (width, height) by decreasing height, then width.
+
+    Equal rectangles stay in their order.
+    """
+    return sorted(
+        range(len(sizes)), key=lambda index: (-sizes[index][1], -sizes[index][0], index)
+    )
+
+
+def _find_shelf(
+    shelves: list[_Shelf], width: int, height: int, side: int
+) -> _Shelf | None:
+    """Return the lowest shelf with room for a rectangle; None if there is no room at all.
+
+    If no shelf has room, a new one is added on top of the others.
+
+    Args:
+        shelves: shelves from bottom to top, each at least `height` high.
+        width, height: size of the rectangle, in texels.
+        side: side of the square, in texels.
+    """
+    if width > side:
+        return None
+    fitting_shelves = [shelf for shelf in shelves if shelf.filled + width <= side]
+    if fitting_shelves:
+        return fitting_shelves[0]
+    top = shelves[-1].bottom + shelves[-1].height if shelves else 0
+    if top + height > side:
+        return None
+    shelves.append(_Shelf(bottom=top, height=height, filled=0))
+    return shelves[-1]
 
 
 def _to_texels(length: float, scale: float) -> int:
@@ -124,23 +143,12 @@ def pack_charts(
     Raises:
         ValueError: there are too many charts for their gutters alone.
     """
-    # Rounded, as machines differ in the last bits: all of them get the same packing.
+    # Machines differ in the last bits: with rounded sizes all get the same packing.
     exact_sizes = [
         (round(width, DECIMALS), round(height, DECIMALS)) for width, height in sizes
     ]
     lying_sizes = [(max(size), min(size)) for size in exact_sizes]
-    lower_scale = 0.0  # at this scale, charts are only their gutters
-    # At this scale the widest chart is as wide as the square: no larger one can fit.
-    upper_scale = side / max(width for width, _ in lying_sizes)
-    best = _shelves(lying_sizes, lower_scale, side)
-    for _ in range(N_BISECTIONS):
-        scale = (lower_scale + upper_scale) / 2
-        rectangles = _shelves(lying_sizes, scale, side)
-        if rectangles is None:
-            upper_scale = scale
-        else:
-            lower_scale = scale
-            best = rectangles
+    best = _pack_at_largest_scale(lying_sizes, side)
     if best is None:
         raise ValueError(
             f"{len(sizes)} charts do not fit an atlas of {side} texels; "
@@ -150,6 +158,30 @@ def pack_charts(
         replace(rectangle, is_rotated=height > width)
         for rectangle, (width, height) in zip(best, exact_sizes, strict=True)
     ]
+
+
+def _pack_at_largest_scale(
+    sizes: Sequence[tuple[float, float]], side: int
+) -> list[AtlasRectangle] | None:
+    """Find the largest scale by bisection; None if not even the gutters fit.
+
+    Args:
+        sizes: (width, height) of each chart, width >= height, in object units.
+        side: side of the atlas in texels.
+    """
+    lower_scale = 0.0  # at this scale, charts are only their gutters
+    # At this scale the widest chart is as wide as the square: no larger one can fit.
+    upper_scale = side / max(width for width, _ in sizes)
+    best = _shelves(sizes, lower_scale, side)
+    for _ in range(N_BISECTIONS):
+        scale = (lower_scale + upper_scale) / 2
+        rectangles = _shelves(sizes, scale, side)
+        if rectangles is None:
+            upper_scale = scale
+        else:
+            lower_scale = scale
+            best = rectangles
+    return best
 
 
 def paint_atlas(
@@ -171,23 +203,36 @@ def paint_atlas(
     image = np.zeros((side, side, 3))
     is_used = np.zeros((side, side), dtype=bool)
     for patch, rectangle in zip(patches, rectangles, strict=True):
-        u, v = _chart_coordinates(rectangle)
-        color = paints[patch.tag](
-            Texels(patch.compute_rest_points(u, v), u, v, patch.size)
-        )
         area = np.s_[
             rectangle.y : rectangle.y + rectangle.height,
             rectangle.x : rectangle.x + rectangle.width,
         ]
-        image[area] = color.reshape(rectangle.height, rectangle.width, 3)
+        image[area] = _paint_chart(patch, rectangle, paints[patch.tag])
         is_used[area] = True
-    # The rest gets the mean color. All values are rounded, since machines differ in the
-    # last bits.
+    # The rest gets the mean color. It is rounded, since machines differ in the last
+    # bits.
     image[~is_used] = np.round(image[is_used].mean(axis=0), 2)
-    top_down = image[::-1]
+    return _round_to_levels(image[::-1])
+
+
+def _paint_chart(patch: Patch, rectangle: AtlasRectangle, paint: Paint) -> Array:
+    """Return the colors (height, width, 3) of the chart of a patch, row 0 at the bottom.
+
+    Args:
+        patch: patch of the object.
+        rectangle: where its chart is in the atlas.
+        paint: paint of the patch.
+    """
+    u, v = _chart_coordinates(rectangle)
+    color = paint(Texels(patch.compute_rest_points(u, v), u, v, patch.size))
+    return color.reshape(rectangle.height, rectangle.width, 3)
+
+
+def _round_to_levels(image: Array) -> npt.NDArray[np.float32]:
+    """Round an image to multiples of 1/255."""
     # Rounded to 4 decimals first: else a level near a half might be rounded up on one
     # machine and down on another.
-    stable_levels = np.round(top_down * 255.0, 4)
+    stable_levels = np.round(image * 255.0, 4)
     # The conversion to integers truncates. With 1/2 added it rounds.
     levels = np.clip(stable_levels + 0.5, 0.5, 255.5).astype(np.uint8)
     return np.asarray(levels.astype(np.float32) / np.float32(255.0))
@@ -226,24 +271,33 @@ def join_patches(
         rectangles: where the chart of each patch is in the atlas.
         side: side of the atlas, in texels.
     """
-    # index of the first vertex of each patch in the mesh
-    first_vertex = np.cumsum([0] + [len(patch.vertices) for patch in patches[:-1]])
-    all_faces = [
-        patch.faces + first for patch, first in zip(patches, first_vertex, strict=True)
-    ]
     all_uvs = [
         _atlas_coordinates(patch, rectangle, side)
         for patch, rectangle in zip(patches, rectangles, strict=True)
     ]
-    faces = np.concatenate(all_faces)
+    faces = _join_faces(patches)
     uvs = np.concatenate(all_uvs)
     normals = np.concatenate([patch.normals for patch in patches])
     vertices = np.concatenate([patch.vertices for patch in patches])
     # the point below the center, at the lowest height, and the largest extent
     origin, extent = assets.find_footing(vertices)
-    vertices = (vertices - origin) / extent
-    # Some vertices at poles belong to no triangle. They are removed: the new index of a
-    # vertex is its position in the ascending array `used`.
+    return _make_compact_mesh((vertices - origin) / extent, faces, normals, uvs)
+
+
+def _make_compact_mesh(
+    vertices: Array, faces: assets.IntArray, normals: Array, uvs: Array
+) -> assets.Mesh:
+    """Return a mesh of rounded values without the vertices that no triangle has.
+
+    There are such vertices at poles.
+
+    Args:
+        vertices: positions (V, 3).
+        faces: vertex indices (F, 3).
+        normals: (V, 3).
+        uvs: texture coordinates (V, 2).
+    """
+    # The new index of a vertex is its position in the ascending array `used`.
     used = np.unique(faces)
     renumbered_faces = np.searchsorted(used, faces).astype(np.uint32)
     return assets.Mesh(
@@ -252,6 +306,16 @@ def join_patches(
         _round_exactly(normals[used]),
         _round_exactly(np.clip(uvs[used], 0.0, 1.0)),
     )
+
+
+def _join_faces(patches: Sequence[Patch]) -> assets.IntArray:
+    """Return the faces (F, 3) of all patches, with vertices numbered over all of them."""
+    # index of the first vertex of each patch in the mesh
+    first_vertex = np.cumsum([0] + [len(patch.vertices) for patch in patches[:-1]])
+    all_faces = [
+        patch.faces + first for patch, first in zip(patches, first_vertex, strict=True)
+    ]
+    return np.concatenate(all_faces)
 
 
 def _atlas_coordinates(patch: Patch, rectangle: AtlasRectangle, side: int) -> Array:
@@ -322,7 +386,7 @@ class ObjectFamily:
         return self.name.replace("-", " ")
 
     def generate(self, rng: np.random.Generator | None) -> assets.ObjectAsset:
-        """Return the canonical instance, or a random one.
+        """Return the canonical instance, or a random one, as an asset.
 
         The mesh has a largest extent of 1 and stands on z = 0. The same state of the
         generator gives the same asset.
@@ -331,36 +395,58 @@ class ObjectFamily:
             rng: random generator that all parameters are sampled from; None for the
                 canonical instance.
         """
-        instance = self.make_instance(ParameterSampler(rng))
-        if instance.materials_by_tag:
-            instance = _sort_by_material(instance)
-        patches = instance.patches
+        instance = self._make_sorted_instance(rng)
         rectangles = pack_charts(_scale_charts(instance), self.atlas_size)
-        mesh = join_patches(patches, rectangles, self.atlas_size)
-        surface = None
+        mesh = join_patches(instance.patches, rectangles, self.atlas_size)
+        surface: dict[str, object] | None = None
         if instance.materials_by_tag:
-            materials = _faces_by_material(patches)
-            mesh = replace(mesh, materials=materials, rig=instance.rig)
-            surface = workbench.library.make_finished_surface(
-                mesh, instance.materials_by_tag, instance.material
-            )
-        vertices = np.concatenate([patch.vertices for patch in patches])
-        extent = np.ptp(vertices, axis=0).max()
+            mesh, surface = _attach_materials(mesh, instance)
+        base_color = paint_atlas(
+            instance.patches, rectangles, instance.paints, self.atlas_size
+        )
         return assets.ObjectAsset(
             name=self.name,
             mesh=mesh,
-            base_color=paint_atlas(
-                patches, rectangles, instance.paints, self.atlas_size
-            ),
+            base_color=base_color,
             material=instance.material,
             label=self.label,
             source=workbench.library.BUNDLED_OBJECT,
             surface=surface,
             finishes=instance.materials_by_tag,
-            # The size of the object is its extent times the length of a unit.
-            size_in_metres=round(float(extent) * self.unit_in_metres, 4),
+            size_in_metres=self._measure_size(instance),
             drives=instance.drives,
         )
+
+    def _make_sorted_instance(self, rng: np.random.Generator | None) -> Instance:
+        """Build the canonical instance (None) or a random one.
+
+        If it has several materials, its patches are sorted by them.
+        """
+        instance = self.make_instance(ParameterSampler(rng))
+        return _sort_by_material(instance) if instance.materials_by_tag else instance
+
+    def _measure_size(self, instance: Instance) -> float:
+        """Return the largest extent of an instance in metres."""
+        vertices = np.concatenate([patch.vertices for patch in instance.patches])
+        extent = np.ptp(vertices, axis=0).max()
+        return round(float(extent) * self.unit_in_metres, 4)
+
+
+def _attach_materials(
+    mesh: assets.Mesh, instance: Instance
+) -> tuple[assets.Mesh, dict[str, object]]:
+    """Return the mesh of an instance with its materials and its rig, and its surface.
+
+    Args:
+        mesh: mesh of the patches of the instance.
+        instance: instance with several materials, whose patches are sorted by material.
+    """
+    materials = _faces_by_material(instance.patches)
+    mesh = replace(mesh, materials=materials, rig=instance.rig)
+    surface = workbench.library.make_finished_surface(
+        mesh, instance.materials_by_tag, instance.material
+    )
+    return mesh, surface
 
 
 def _scale_charts(instance: Instance) -> list[tuple[float, float]]:
@@ -430,13 +516,11 @@ def sample_material(
     # real objects of this kind.
     if sampler.sample_bool(0.3):
         clearcoat = sampler(clearcoat, low=0.0, high=1.0)
-    metallic = 0.0
-    if sampler.sample_bool(0.06):
-        metallic = sampler(0.0, low=0.3, high=0.8)
+    is_metallic = sampler.sample_bool(0.06)
     values = {
         # at least 0.12, as the reflections of a mirror would be noisy
         "roughness": min(max(sampled_roughness, 0.12), 0.95),
-        "metallic": metallic,
+        "metallic": sampler(0.0, low=0.3, high=0.8) if is_metallic else 0.0,
         "specular": sampler(0.5, low=0.3, high=0.7),
         "clearcoat": clearcoat,
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import product
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ from advsearch.questions.harden.objects.family import (
     make_family,
     sample_material,
 )
-from advsearch.questions.harden.objects.shapes import Array, Patch
+from advsearch.questions.harden.objects.shapes import Array, Patch, Points
 from advsearch.questions.harden.objects.textures import (
     Color,
     Paint,
@@ -80,6 +81,28 @@ def _post(
     )
 
 
+class _ChairSize(NamedTuple):
+    """Measures of a chair in centimeters.
+
+    Attributes:
+        width, depth: size of the seat along y and x.
+        seat_height, total_height: heights of the seat, and of the top of the back.
+        seat_thickness: thickness of the seat.
+        leg_radius: radius of a leg at its top.
+        splay: how much farther out a foot is than the top of its leg.
+        lean: how far the back's top is behind the seat.
+    """
+
+    width: float
+    depth: float
+    seat_height: float
+    total_height: float
+    seat_thickness: float
+    leg_radius: float
+    splay: float
+    lean: float
+
+
 @make_family(unit_in_metres=0.01)  # built in centimeters
 def chair(sampler: ParameterSampler) -> Instance:
     """Make a chair that faces +x, with its back at -x, and turn it a little about z.
@@ -87,35 +110,50 @@ def chair(sampler: ParameterSampler) -> Instance:
     Lengths are in centimeters, angles in degrees. `sampler(x, low=..., high=...)`
     returns x for the canonical chair and a uniform sample for a random one.
     """
-    width = sampler(43.0, low=36.0, high=50.0)
-    depth = sampler(42.0, low=36.0, high=48.0)
-    seat_height = sampler(45.0, low=40.0, high=50.0)
-    total_height = sampler(92.0, low=78.0, high=108.0)
-    seat_thickness = sampler(3.6, low=2.4, high=5.5)
-    leg_radius = sampler(2.1, low=1.5, high=3.0)
-    splay = sampler(1.5, low=0.0, high=6.0)
-    lean = sampler(5.0, low=1.0, high=11.0)  # how far the back's top is behind the seat
-    section = _leg_section(sampler)
-    legs = _Legs(
-        x=depth / 2 - leg_radius - LEG_INSET,
-        y=width / 2 - leg_radius - LEG_INSET,
-        splay=splay,
-        radius=leg_radius,
-        foot_radius=leg_radius * sampler(0.75, low=0.55, high=1.0),
-        section=section,
-    )
-    patches = _chair_legs(legs, seat_height - seat_thickness)
-    patches += _chair_seat(sampler, (depth, width, seat_thickness), seat_height)
+    size = _sample_chair_size(sampler)
+    legs = _sample_legs(sampler, size)
+    patches = _chair_legs(legs, size.seat_height - size.seat_thickness)
+    seat_size = (size.depth, size.width, size.seat_thickness)
+    patches += _chair_seat(sampler, seat_size, size.seat_height)
     if sampler.sample_bool(0.55, canonical=True):
-        patches += _chair_rungs(sampler, legs, seat_height)
-    patches += _chair_back(sampler, legs, seat_height, total_height, lean)
+        patches += _chair_rungs(sampler, legs, size.seat_height)
+    patches += _chair_back(
+        sampler, legs, size.seat_height, size.total_height, size.lean
+    )
     rotated = shapes.transform_patches(
         patches, shapes.make_rotation_matrix("z", sampler(8.0, low=-25.0, high=25.0))
     )
     return Instance(
         rotated,
-        _chair_paints(sampler, total_height),
+        _chair_paints(sampler, size.total_height),
         sample_material(sampler, roughness=0.45, clearcoat=0.2),
+    )
+
+
+def _sample_chair_size(sampler: ParameterSampler) -> _ChairSize:
+    """Sample the measures of a chair."""
+    return _ChairSize(
+        width=sampler(43.0, low=36.0, high=50.0),
+        depth=sampler(42.0, low=36.0, high=48.0),
+        seat_height=sampler(45.0, low=40.0, high=50.0),
+        total_height=sampler(92.0, low=78.0, high=108.0),
+        seat_thickness=sampler(3.6, low=2.4, high=5.5),
+        leg_radius=sampler(2.1, low=1.5, high=3.0),
+        splay=sampler(1.5, low=0.0, high=6.0),
+        lean=sampler(5.0, low=1.0, high=11.0),
+    )
+
+
+def _sample_legs(sampler: ParameterSampler, size: _ChairSize) -> _Legs:
+    """Sample the legs of a chair: their section, and their radius at the floor."""
+    section = _leg_section(sampler)
+    return _Legs(
+        x=size.depth / 2 - size.leg_radius - LEG_INSET,
+        y=size.width / 2 - size.leg_radius - LEG_INSET,
+        splay=size.splay,
+        radius=size.leg_radius,
+        foot_radius=size.leg_radius * sampler(0.75, low=0.55, high=1.0),
+        section=section,
     )
 
 
@@ -154,23 +192,16 @@ def _chair_seat(
         seat_height: height of its upper side.
     """
     depth, width, thickness = size
+    middle = (0.0, 0.0, seat_height - thickness / 2)
     patches = shapes.make_rounded_box(
-        "seat",
-        (0.0, 0.0, seat_height - thickness / 2),
-        size,
-        bevel=0.45 * thickness,
-        steps=3,
-        cells=2,
+        "seat", middle, size, bevel=0.45 * thickness, steps=3, cells=2
     )
     if sampler.sample_bool(0.35):
         # The cushion overlaps the seat a little, so that there is no gap.
+        cushion_middle = (0.5, 0.0, seat_height + 1.4)
+        cushion_size = (depth - 4.0, width - 4.0, 4.4)
         patches += shapes.make_rounded_box(
-            "cushion",
-            (0.5, 0.0, seat_height + 1.4),
-            (depth - 4.0, width - 4.0, 4.4),
-            bevel=2.1,
-            steps=3,
-            cells=2,
+            "cushion", cushion_middle, cushion_size, bevel=2.1, steps=3, cells=2
         )
     return patches
 
@@ -213,6 +244,30 @@ def _chair_paints(sampler: ParameterSampler, total_height: float) -> dict[str, P
         total_height: height of the chair.
     """
     offset = sampler.sample_noise_offset()
+    make_wood = _sample_chair_wood(sampler, total_height, offset)
+    fabric = _sample_fabric(sampler, offset)
+    seat_paint = fabric if sampler.sample_bool(0.25) else make_wood(0)
+    return {
+        "up": make_wood(2),
+        "along": make_wood(0),
+        "cross": make_wood(1),
+        "seat": seat_paint,
+        "cushion": fabric,
+    }
+
+
+def _sample_chair_wood(
+    sampler: ParameterSampler, total_height: float, offset: Array
+) -> Callable[[int], Paint]:
+    """Sample the paint of wooden parts, as a function of the axis of their grain.
+
+    The grain shows unless the wood is painted.
+
+    Args:
+        sampler: samples the colors.
+        total_height: height of the chair.
+        offset: (3,) into the noise.
+    """
     timber = sampler.sample_color(
         "a86f3d", "c79a63", "6b4226", "3a2418", "d8bc92", p_random=0.0
     )
@@ -223,30 +278,20 @@ def _chair_paints(sampler: ParameterSampler, total_height: float) -> dict[str, P
     wood_paint = choose_paint_or_random(
         sampler, total_height, paint_solid_color(paint_color), p_random=0.5
     )
+    if is_painted:
+        return lambda axis: wood_paint
+    return lambda axis: wood(timber, scale=3.2, offset=offset, axis=axis, contrast=0.36)
 
-    def wood_along(axis: int) -> Paint:
-        """Return the paint of a wooden part whose grain, if seen, is along an axis."""
-        if is_painted:
-            return wood_paint
-        return wood(timber, scale=3.2, offset=offset, axis=axis, contrast=0.36)
 
-    fabric_color = sampler.sample_color(
-        "8a2f2a", "2f4f6f", "566b3f", "c9b48a", "4a4a4f"
+def _sample_fabric(sampler: ParameterSampler, offset: Array) -> Paint:
+    """Sample the paint of a fabric, with an offset (3,) into the noise."""
+    color = sampler.sample_color("8a2f2a", "2f4f6f", "566b3f", "c9b48a", "4a4a4f")
+    return sampler.sample_choice(
+        paint_shaded_clouds(color, factor=0.8, scale=1.5, offset=offset),
+        stripes(color, scale_brightness(color, 1.5), cell=6.0),
+        checks(color, parse_hex_color("efe6d4"), cell=4.0),
+        dots(paint_solid_color(color), parse_hex_color("f4efe4"), cell=6.0),
     )
-    fabric = sampler.sample_choice(
-        paint_shaded_clouds(fabric_color, factor=0.8, scale=1.5, offset=offset),
-        stripes(fabric_color, scale_brightness(fabric_color, 1.5), cell=6.0),
-        checks(fabric_color, parse_hex_color("efe6d4"), cell=4.0),
-        dots(paint_solid_color(fabric_color), parse_hex_color("f4efe4"), cell=6.0),
-    )
-    seat_paint = fabric if sampler.sample_bool(0.25) else wood_along(0)
-    return {
-        "up": wood_along(2),
-        "along": wood_along(0),
-        "cross": wood_along(1),
-        "seat": seat_paint,
-        "cushion": fabric,
-    }
 
 
 class _ChairBack(NamedTuple):
@@ -305,9 +350,6 @@ def _chair_back(
 ) -> list[Patch]:
     """Create the back of a chair: two posts, and what is between them.
 
-    There are four styles. "slats" are vertical slats between two rails. "arch" has the
-    upper rail only. "ladder" has horizontal bars, and "panel" one board.
-
     Args:
         sampler: samples the kind and its proportions.
         legs: legs that the posts continue upwards.
@@ -324,12 +366,25 @@ def _chair_back(
         width=2 * (legs.y - 0.3 * legs.radius),
         board_thickness=sampler(1.6, low=1.2, high=2.4),
     )
-    patches = _back_posts(back, legs)
+    return _back_posts(back, legs) + _back_boards(sampler, style, back)
+
+
+def _back_boards(
+    sampler: ParameterSampler, style: str, back: _ChairBack
+) -> list[Patch]:
+    """Create what is between the posts of a chair's back.
+
+    Args:
+        sampler: samples the proportions.
+        style: "slats" are vertical slats between two rails. "arch" has the upper rail
+            only. "ladder" has horizontal bars, and "panel" one board.
+        back: size and position of the back.
+    """
     if style in ("slats", "arch"):
-        return patches + _slatted_back(sampler, back, has_lower_rail=style == "slats")
+        return _slatted_back(sampler, back, has_lower_rail=style == "slats")
     if style == "ladder":
-        return patches + _ladder_back(sampler, back)
-    return patches + _panel_back(sampler, back)
+        return _ladder_back(sampler, back)
+    return _panel_back(sampler, back)
 
 
 def _back_posts(back: _ChairBack, legs: _Legs) -> list[Patch]:
@@ -364,7 +419,13 @@ def _slatted_back(
         patches += back.make_board(
             "cross", back.bottom + 0.2 * back.height, back.width, 0.09 * back.height
         )
+    return patches + _back_slats(sampler, back, low)
+
+
+def _back_slats(sampler: ParameterSampler, back: _ChairBack, low: float) -> list[Patch]:
+    """Create the vertical slats of a back, from a height up to the upper rail."""
     high = back.top - 0.15 * back.height
+    patches = list[Patch]()
     n_slats = int(sampler.sample_choice(5, 3, 4, 6))
     for i in range(n_slats):
         patches += back.make_board(
@@ -423,16 +484,7 @@ def _shade(sampler: ParameterSampler, size: _ShadeSize) -> list[Patch]:
         size: the size of the shade.
     """
     wall = 0.25  # thickness
-    bulge = sampler(0.0, low=-0.1, high=0.12) * size.bottom_radius
-    middle_radius = (size.bottom_radius + size.top_radius) / 2 + bulge
-    outer = shapes.sample_spline(
-        [
-            (size.bottom_radius, size.bottom),
-            (middle_radius, (size.bottom + size.top) / 2),
-            (size.top_radius, size.top),
-        ],
-        count=14,
-    )
+    outer = _shade_profile(sampler, size)
     # The inside is the outside, moved towards the axis and followed downwards.
     inner = (outer - np.array([wall, 0.0]))[::-1]
     pieces = [
@@ -442,6 +494,18 @@ def _shade(sampler: ParameterSampler, size: _ShadeSize) -> list[Patch]:
         ("rim", [inner[-1], outer[0]]),
     ]
     return shapes.revolve_profile(pieces, columns=56)
+
+
+def _shade_profile(sampler: ParameterSampler, size: _ShadeSize) -> Array:
+    """Sample the profile (14, 2) of points (r, z) of a shade's outside, upwards."""
+    bulge = sampler(0.0, low=-0.1, high=0.12) * size.bottom_radius
+    middle_radius = (size.bottom_radius + size.top_radius) / 2 + bulge
+    knots = [
+        (size.bottom_radius, size.bottom),
+        (middle_radius, (size.bottom + size.top) / 2),
+        (size.top_radius, size.top),
+    ]
+    return shapes.sample_spline(knots, count=14)
 
 
 def _lamp_base(
@@ -520,37 +584,49 @@ def _body_base(
         has_waist: whether the body narrows above the belly and widens again, as a gourd
             does.
     """
+    belly_knots = _sample_belly_knots(sampler, height, foot_radius, has_waist=has_waist)
+    # profiles of points (r, z)
+    under = [(0.0, 0.0), (foot_radius - 0.4, 0.0)]
+    top = [(stem_radius, height), (0.0, height)]
+    knots = [
+        *belly_knots,
+        (stem_radius * 1.5, 0.86 * height),
+        (stem_radius, 0.93 * height),
+    ]
+    foot_corners = [under[-1], (foot_radius, 0.2), (foot_radius, 1.2), knots[0]]
+    foot_ring = shapes.round_corners(foot_corners, radius=[0.15, 0.3], steps=3)
+    pieces: list[tuple[str, Points]] = [
+        ("base", under),
+        ("foot", foot_ring),
+        ("body", shapes.sample_spline(knots, count=34)),
+        ("base", [knots[-1], top[0]]),
+        ("base", top),
+    ]
+    return shapes.revolve_profile(pieces, columns=44)
+
+
+def _sample_belly_knots(
+    sampler: ParameterSampler, height: float, foot_radius: float, *, has_waist: bool
+) -> list[tuple[float, float]]:
+    """Sample points (r, z) of a turned body, from the foot over the belly upwards.
+
+    Args:
+        sampler: samples radius and height of the belly.
+        height: height of the stem's end.
+        foot_radius: radius of the foot ring.
+        has_waist: whether it narrows above the belly and widens again.
+    """
     belly = foot_radius * sampler(1.12, low=0.95, high=1.4)
     belly_height = sampler(0.38, low=0.28, high=0.6) * height
     above_belly = [(0.45 * belly, 0.72 * height)]
     if has_waist:
         above_belly = [(0.55 * belly, 0.6 * height), (0.72 * belly, 0.73 * height)]
-    # profiles of points (r, z)
-    under = [(0.0, 0.0), (foot_radius - 0.4, 0.0)]
-    top = [(stem_radius, height), (0.0, height)]
-    knots = [
+    return [
         (foot_radius * 0.96, 1.2),
         (foot_radius * 0.8, 2.4),
         (belly, belly_height),
         *above_belly,
-        (stem_radius * 1.5, 0.86 * height),
-        (stem_radius, 0.93 * height),
     ]
-    foot_ring = shapes.round_corners(
-        [under[-1], (foot_radius, 0.2), (foot_radius, 1.2), knots[0]],
-        radius=[0.15, 0.3],
-        steps=3,
-    )
-    return shapes.revolve_profile(
-        [
-            ("base", under),
-            ("foot", foot_ring),
-            ("body", shapes.sample_spline(knots, count=34)),
-            ("base", [knots[-1], top[0]]),
-            ("base", top),
-        ],
-        columns=44,
-    )
 
 
 def _shade_paint(
@@ -573,34 +649,53 @@ def _shade_paint(
         "plain", "band", "stripes", "dots", "rings", "gradient"
     )
     accent = sampler.sample_color("b08d3c", "7a1f2b", "23395d", "efe6cf")
-
-    def with_edges(color: Color, width: float) -> Paint:
-        """Return the cloth with both edges of a color, `width` wide."""
-        lower_edge = paint_over(
-            cloth, make_range_mask(0.0, bottom + width), paint_solid_color(color)
-        )
-        return paint_over(
-            lower_edge, make_range_mask(top - width, 2 * top), paint_solid_color(color)
-        )
-
     if pattern == "plain":
-        paint = with_edges(scale_brightness(linen, 0.75), 0.5)  # hems
+        hem_color = scale_brightness(linen, 0.75)
+        paint = _paint_edges(cloth, hem_color, 0.5, bottom, top)
     elif pattern == "band":
-        paint = with_edges(accent, 1.4)
-    elif pattern == "stripes":
-        paint = stripes(
-            linen,
-            accent,
-            cell=sampler(5.0, low=3.0, high=9.0),
-            fraction=sampler(0.4, low=0.2, high=0.6),
-        )
-    elif pattern == "dots":
-        paint = dots(cloth, accent, cell=sampler(6.0, low=4.0, high=9.0))
-    elif pattern == "rings":
-        paint = rings(linen, accent, period=sampler(6.0, low=3.0, high=10.0))
-    else:
+        paint = _paint_edges(cloth, accent, 1.4, bottom, top)
+    elif pattern == "gradient":
         paint = gradient(linen, scale_brightness(linen, 0.6), low=bottom, high=top)
+    else:
+        paint = _sample_shade_pattern(sampler, pattern, linen, cloth, accent)
     return choose_paint_or_random(sampler, top, paint, p_random=0.3)
+
+
+def _paint_edges(
+    cloth: Paint, color: Color, width: float, bottom: float, top: float
+) -> Paint:
+    """Return the paint of a shade with both edges of another color.
+
+    Args:
+        cloth: paint of the shade.
+        color: color of the edges.
+        width: width of the edges.
+        bottom, top: heights of the shade's edges.
+    """
+    edge_paint = paint_solid_color(color)
+    lower_edge = paint_over(cloth, make_range_mask(0.0, bottom + width), edge_paint)
+    return paint_over(lower_edge, make_range_mask(top - width, 2 * top), edge_paint)
+
+
+def _sample_shade_pattern(
+    sampler: ParameterSampler, pattern: str, linen: Color, cloth: Paint, accent: Color
+) -> Paint:
+    """Sample the proportions of a pattern of a lamp's shade.
+
+    Args:
+        sampler: samples the proportions.
+        pattern: "stripes", "dots" or "rings".
+        linen: color of the cloth.
+        cloth: paint of the cloth.
+        accent: color of the pattern.
+    """
+    if pattern == "stripes":
+        cell = sampler(5.0, low=3.0, high=9.0)
+        fraction = sampler(0.4, low=0.2, high=0.6)
+        return stripes(linen, accent, cell=cell, fraction=fraction)
+    if pattern == "dots":
+        return dots(cloth, accent, cell=sampler(6.0, low=4.0, high=9.0))
+    return rings(linen, accent, period=sampler(6.0, low=3.0, high=10.0))
 
 
 @make_family(unit_in_metres=0.01)
@@ -611,37 +706,46 @@ def lamp(sampler: ParameterSampler) -> Instance:
     canonical lamp and a uniform sample for a random one, and `sampler.sample_choice` the first
     choice or a random one.
     """
-    total_height = sampler(48.0, low=42.0, high=58.0)
-    shade_height = sampler(20.0, low=14.0, high=24.0)
-    bottom_radius = sampler(16.5, low=12.0, high=19.0)
-    top_radius = bottom_radius * sampler(0.6, low=0.35, high=1.0)
-    size = _ShadeSize(
-        bottom=total_height - shade_height,
-        top=total_height,
-        height=shade_height,
-        bottom_radius=bottom_radius,
-        top_radius=top_radius,
-    )
+    size = _sample_shade_size(sampler)
     foot_radius = sampler(7.4, low=6.0, high=9.5)
     stem_radius = sampler(0.8, low=0.6, high=1.3)
     style = sampler.sample_choice("body", "disc", "gourd")  # style of the base
     # The base reaches into the shade, to just under the bulb.
-    base_height = size.bottom + 0.25 * shade_height
+    base_height = size.bottom + 0.25 * size.height
     patches = _lamp_base(sampler, style, base_height, foot_radius, stem_radius)
     patches += _shade(sampler, size)
-    patches += shapes.make_sphere_patches(
-        "bulb",
-        min(3.0, 0.4 * top_radius),
-        center=(0.0, 0.0, size.bottom + 0.42 * shade_height),
-        rows=12,
-        columns=20,
-    )
+    patches += _bulb(size)
     patches += _lamp_frame(size)
     return Instance(
         patches,
-        _lamp_paints(sampler, size.bottom, total_height, style),
+        _lamp_paints(sampler, size.bottom, size.top, style),
         sample_material(sampler, roughness=0.4, clearcoat=0.3),
         texel_density={"lining": 0.6},  # fewer texels: it is hardly visible
+    )
+
+
+def _sample_shade_size(sampler: ParameterSampler) -> _ShadeSize:
+    """Sample the size of a lampshade, whose upper edge is the top of the lamp."""
+    total_height = sampler(48.0, low=42.0, high=58.0)
+    shade_height = sampler(20.0, low=14.0, high=24.0)
+    bottom_radius = sampler(16.5, low=12.0, high=19.0)
+    return _ShadeSize(
+        bottom=total_height - shade_height,
+        top=total_height,
+        height=shade_height,
+        bottom_radius=bottom_radius,
+        top_radius=bottom_radius * sampler(0.6, low=0.35, high=1.0),
+    )
+
+
+def _bulb(size: _ShadeSize) -> list[Patch]:
+    """Create the bulb inside of a shade."""
+    return shapes.make_sphere_patches(
+        "bulb",
+        min(3.0, 0.4 * size.top_radius),
+        center=(0.0, 0.0, size.bottom + 0.42 * size.height),
+        rows=12,
+        columns=20,
     )
 
 
@@ -651,19 +755,9 @@ def _lamp_frame(size: _ShadeSize) -> list[Patch]:
     Args:
         size: the size of the shade.
     """
-    patches = list[Patch]()
     # The spokes are 12 % below the upper edge of the shade, and end at its wall.
     spoke_z = size.top - 0.12 * size.height
     spoke_length = size.top_radius + (size.bottom_radius - size.top_radius) * 0.12
-    for angle in (20.0, 140.0, 260.0):
-        spoke = shapes.sweep_section(
-            "base",
-            [(0.0, 0.0, spoke_z), (spoke_length, 0.0, spoke_z)],
-            shapes.ellipse(0.22, 0.22, count=8),
-        )
-        patches += shapes.transform_patches(
-            spoke, shapes.make_rotation_matrix("z", angle)
-        )
     # from the bulb up to a small knob above the spokes
     rod_heights = (
         size.bottom + 0.2 * size.height,
@@ -671,14 +765,33 @@ def _lamp_frame(size: _ShadeSize) -> list[Patch]:
         spoke_z + 0.8,
         spoke_z + 1.0,
     )
-    patches += shapes.sweep_section(
+    rod = shapes.sweep_section(
         "base",
         [(0, 0, z) for z in rod_heights],
         shapes.ellipse(0.35, 0.35, count=10),
         (1.0, 1.0, 1.6, 0.0),
         start_axis=(1.0, 0.0, 0.0),
     )
+    return _lamp_spokes(spoke_z, spoke_length) + rod
+
+
+def _lamp_spokes(z: float, length: float) -> list[Patch]:
+    """Create three spokes of a length at a height."""
+    patches = list[Patch]()
+    for angle in (20.0, 140.0, 260.0):
+        spoke = shapes.sweep_section(
+            "base",
+            [(0.0, 0.0, z), (length, 0.0, z)],
+            shapes.ellipse(0.22, 0.22, count=8),
+        )
+        patches += shapes.transform_patches(
+            spoke, shapes.make_rotation_matrix("z", angle)
+        )
     return patches
+
+
+LINENS = ("f1e3c4", "f4f1e8", "c9b48a", "b5442e", "2f5d7c", "3d6b4a", "20242a")
+"""Colors of lampshades."""
 
 
 def _lamp_paints(
@@ -693,26 +806,9 @@ def _lamp_paints(
         style: style of the base, as for `_lamp_base`.
     """
     offset = sampler.sample_noise_offset()
-    linen = sampler.sample_color(
-        "f1e3c4",
-        "f4f1e8",
-        "c9b48a",
-        "b5442e",
-        "2f5d7c",
-        "3d6b4a",
-        "20242a",
-        p_random=0.25,
-    )
+    linen = sampler.sample_color(*LINENS, p_random=0.25)
     cloth = _shade_paint(sampler, linen, offset, shade_bottom, total_height)
-    clay = sampler.sample_color(
-        "2f6f6a", "23408f", "b5442e", "f2f1ea", "22262b", "8a5a32", "c9a24b"
-    )
-    body = choose_paint_or_random(
-        sampler,
-        total_height,
-        paint_shaded_clouds(clay, factor=1.3, scale=4.0, offset=offset),
-        p_random=0.35,
-    )
+    body = _sample_body_paint(sampler, total_height, offset)
     metal = sampler.sample_color("b08d3c", "2b2d30", "b4b8bd", "8a5a32", p_random=0.15)
     # a flat foot may be painted as a body is
     is_base_painted = style == "disc" and sampler.sample_bool(0.5)
@@ -725,3 +821,20 @@ def _lamp_paints(
         "foot": paint_solid_color(metal),
         "base": body if is_base_painted else paint_solid_color(metal),
     }
+
+
+def _sample_body_paint(
+    sampler: ParameterSampler, total_height: float, offset: Array
+) -> Paint:
+    """Sample the paint of a lamp's turned body: clouds of a clay, or any other paint.
+
+    Args:
+        sampler: samples the paint.
+        total_height: height of the lamp.
+        offset: (3,) into the noise.
+    """
+    clay = sampler.sample_color(
+        "2f6f6a", "23408f", "b5442e", "f2f1ea", "22262b", "8a5a32", "c9a24b"
+    )
+    clouds = paint_shaded_clouds(clay, factor=1.3, scale=4.0, offset=offset)
+    return choose_paint_or_random(sampler, total_height, clouds, p_random=0.35)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 import advsearch.questions.harden.objects.shapes as shapes
@@ -126,23 +128,34 @@ def teapot(sampler: ParameterSampler) -> Instance:
     """Make a teapot with spout, handle and lid of random proportions."""
     radius = sampler(7.2, low=6.4, high=8.0)
     height = sampler(10.2, low=8.0, high=12.5)
-    side, body = _teapot_body(sampler, radius, height)
-    handle = _teapot_handle(sampler, side, radius, height)
-    # Spout and handle are both made at +x, and the handle is turned.
-    opposite = shapes.make_rotation_matrix("z", 180.0)
-    patches = [
-        *body,
-        *_spout(sampler, radius, height),
-        *shapes.transform_patches(handle, opposite),
-    ]
+    patches = _teapot_patches(sampler, radius, height)
+    view_rotation = shapes.make_rotation_matrix("z", VIEW_DEGREES)
     return Instance(
-        shapes.transform_patches(
-            patches, shapes.make_rotation_matrix("z", VIEW_DEGREES)
-        ),
+        shapes.transform_patches(patches, view_rotation),
         _teapot_paints(sampler, height),
         sample_material(sampler, roughness=0.25, clearcoat=0.7),
         texel_density={"base": 0.6},
     )
+
+
+def _teapot_patches(
+    sampler: ParameterSampler, radius: float, height: float
+) -> list[Patch]:
+    """Create a teapot with its spout at +x and its handle at -x.
+
+    Args:
+        sampler: samples its proportions.
+        radius, height: radius and height of its body.
+    """
+    side, body = _teapot_body(sampler, radius, height)
+    handle = _teapot_handle(sampler, side, radius, height)
+    # Spout and handle are both made at +x, and the handle is turned.
+    opposite = shapes.make_rotation_matrix("z", 180.0)
+    return [
+        *body,
+        *_spout(sampler, radius, height),
+        *shapes.transform_patches(handle, opposite),
+    ]
 
 
 def _teapot_body(
@@ -158,18 +171,9 @@ def _teapot_body(
         radius: radius of the belly.
         height: height of the mouth.
     """
-    foot = radius * sampler(0.58, low=0.5, high=0.75)
-    mouth = radius * sampler(0.48, low=0.42, high=0.6)
-    # a fraction of the height, and of the radius halfway up to the belly
-    belly_height = sampler(0.45, low=0.35, high=0.58)
-    fullness = sampler(0.9, low=0.82, high=0.97)
-    knots = [
-        (foot, 0.5),
-        (radius * fullness, 0.5 * belly_height * height),
-        (radius, belly_height * height),
-        (radius * (0.97 * fullness), (0.42 * belly_height + 0.58) * height),
-        (mouth, height),
-    ]
+    knots = _sample_teapot_knots(sampler, radius, height)
+    foot, _ = knots[0]
+    mouth, _ = knots[-1]
     side = shapes.sample_spline(knots, count=26)
     under = [(0.0, 0.2), (foot * 0.8, 0.2), (foot * 0.86, 0.0), (foot * 0.97, 0.0)]
     profile: list[tuple[str, Points]] = [
@@ -178,6 +182,30 @@ def _teapot_body(
         *_lid_profile(sampler, mouth, height),
     ]
     return side, shapes.revolve_profile(profile, columns=56)
+
+
+def _sample_teapot_knots(
+    sampler: ParameterSampler, radius: float, height: float
+) -> list[tuple[float, float]]:
+    """Sample the points (r, z) of a teapot's side, from the foot to the mouth.
+
+    Args:
+        sampler: samples its proportions.
+        radius: radius of the belly.
+        height: height of the mouth.
+    """
+    foot = radius * sampler(0.58, low=0.5, high=0.75)
+    mouth = radius * sampler(0.48, low=0.42, high=0.6)
+    # a fraction of the height, and of the radius halfway up to the belly
+    belly_height = sampler(0.45, low=0.35, high=0.58)
+    fullness = sampler(0.9, low=0.82, high=0.97)
+    return [
+        (foot, 0.5),
+        (radius * fullness, 0.5 * belly_height * height),
+        (radius, belly_height * height),
+        (radius * (0.97 * fullness), (0.42 * belly_height + 0.58) * height),
+        (mouth, height),
+    ]
 
 
 def _lid_profile(
@@ -192,30 +220,50 @@ def _lid_profile(
     dome = sampler(1.5, low=0.7, high=2.4)
     knob_radius = sampler(1.0, low=0.7, high=1.4)
     top = height + dome + 0.2  # height of the lid's top
-    # over the edge of the mouth, with a narrow groove where the lid begins
-    rim = [
-        (mouth, height),
-        (mouth * 0.97, height + 0.02),
-        (mouth * 0.94, height - 0.12),
-        (mouth * 0.94, height + 0.05),
-        (mouth * 0.97, height + 0.05),
-    ]
+    rim = _mouth_rim(mouth, height)
     lid_knots = [
         rim[-1],
         (mouth * 0.9, height + 0.35),
         (mouth * 0.55, height + 0.75 * dome + 0.2),
         (0.35, top),
     ]
-    knob_knots = [
-        (0.45, top),
-        (0.5, top + 0.3),
-        (knob_radius, top + 0.45 + knob_radius * 0.6),
-        (0.7 * knob_radius, top + 0.45 + 1.35 * knob_radius),
-        (0.0, top + 0.45 + 1.6 * knob_radius),
-    ]
     lid = shapes.sample_spline(lid_knots, count=10)
-    knob = shapes.sample_spline(knob_knots, count=12)
+    knob = _knob_profile(knob_radius, top)
     return [("body", rim), ("lid", lid), ("knob", [lid[-1], *knob])]
+
+
+def _mouth_rim(mouth: float, height: float) -> list[tuple[float, float]]:
+    """Return the points (r, z) of the edge of a teapot's mouth.
+
+    It has a narrow groove where the lid begins.
+
+    Args:
+        mouth, height: radius and height of the mouth.
+    """
+    return [
+        (mouth, height),
+        (mouth * 0.97, height + 0.02),
+        (mouth * 0.94, height - 0.12),
+        (mouth * 0.94, height + 0.05),
+        (mouth * 0.97, height + 0.05),
+    ]
+
+
+def _knob_profile(radius: float, bottom: float) -> Array:
+    """Return the points (12, 2), (r, z), of the knob of a lid.
+
+    Args:
+        radius: radius of the knob.
+        bottom: height at which it begins.
+    """
+    knots = [
+        (0.45, bottom),
+        (0.5, bottom + 0.3),
+        (radius, bottom + 0.45 + radius * 0.6),
+        (0.7 * radius, bottom + 0.45 + 1.35 * radius),
+        (0.0, bottom + 0.45 + 1.6 * radius),
+    ]
+    return shapes.sample_spline(knots, count=12)
 
 
 def _teapot_handle(
@@ -225,6 +273,26 @@ def _teapot_handle(
 
     Args:
         sampler: samples its curve and its section.
+        side: profile (K, 2) of the body.
+        radius, height: radius and height of the body.
+    """
+    curve = _sample_teapot_handle_curve(sampler, side, radius, height)
+    section = shapes.ellipse(
+        sampler(0.5, low=0.4, high=0.7), sampler(0.62, low=0.45, high=0.85), count=16
+    )
+    root_flare = 1.0 + 0.2 * np.abs(np.linspace(-1, 1, 26)) ** 3  # thicker at both ends
+    return shapes.sweep_section(
+        "handle", shapes.to_xz_plane(curve), section, root_flare
+    )
+
+
+def _sample_teapot_handle_curve(
+    sampler: ParameterSampler, side: Array, radius: float, height: float
+) -> Array:
+    """Sample the curve (26, 2), (x, z), of a teapot's handle, from top to bottom.
+
+    Args:
+        sampler: samples how far it reaches.
         side: profile (K, 2) of the body.
         radius, height: radius and height of the body.
     """
@@ -245,14 +313,7 @@ def _teapot_handle(
         (radius + 0.4 * reach, bottom + 0.08 * (top - bottom)),
         (bottom_radius, bottom),
     ]
-    section = shapes.ellipse(
-        sampler(0.5, low=0.4, high=0.7), sampler(0.62, low=0.45, high=0.85), count=16
-    )
-    root_flare = 1.0 + 0.2 * np.abs(np.linspace(-1, 1, 26)) ** 3  # thicker at both ends
-    curve = shapes.sample_spline(knots, count=26)
-    return shapes.sweep_section(
-        "handle", shapes.to_xz_plane(curve), section, root_flare
-    )
+    return shapes.sample_spline(knots, count=26)
 
 
 def _teapot_paints(sampler: ParameterSampler, height: float) -> dict[str, Paint]:
@@ -266,17 +327,35 @@ def _teapot_paints(sampler: ParameterSampler, height: float) -> dict[str, Paint]
     )
     accent = sampler.sample_color("e8cfa0", "23408f", "c9a24b", "f4efe4", "b5442e")
     decoration = _teapot_decoration(sampler, clay, glaze, accent, height, offset)
-    paint = choose_paint_or_random(sampler, height + 4.0, decoration)
-    trim = sampler.sample_choice(glaze, paint_solid_color(accent), paint)
+    body = choose_paint_or_random(sampler, height + 4.0, decoration)
     return {
         "base": paint_solid_color("a98663"),
-        "body": paint,
-        "lid": sampler.sample_choice(paint, trim),
-        "spout": sampler.sample_choice(glaze, paint),
-        "handle": sampler.sample_choice(glaze, trim),
-        "knob": paint_solid_color(accent)
-        if sampler.sample_bool(0.5, canonical=True)
-        else trim,
+        "body": body,
+        **_sample_attached_paints(sampler, glaze, paint_solid_color(accent), body),
+    }
+
+
+def _sample_attached_paints(
+    sampler: ParameterSampler, glaze: Paint, accent: Paint, body: Paint
+) -> dict[str, Paint]:
+    """Sample which paint the lid, the spout, the handle and the knob of a teapot have.
+
+    Args:
+        sampler: chooses the paints.
+        glaze: paint of the clay.
+        accent: paint of the decoration's color.
+        body: paint of the body.
+    """
+    trim = sampler.sample_choice(glaze, accent, body)
+    lid = sampler.sample_choice(body, trim)
+    spout = sampler.sample_choice(glaze, body)
+    handle = sampler.sample_choice(glaze, trim)
+    has_accent_knob = sampler.sample_bool(0.5, canonical=True)
+    return {
+        "lid": lid,
+        "spout": spout,
+        "handle": handle,
+        "knob": accent if has_accent_knob else trim,
     }
 
 
@@ -302,27 +381,15 @@ def _teapot_decoration(
         "bands", "plain", "dots", "stripes", "rings", "speckle"
     )
     if kind == "bands":
-        lower_band = make_range_mask(0.7 * height, 0.74 * height, soft=0.1)
-        upper_band = make_range_mask(0.77 * height, 0.785 * height, soft=0.1)
-        return paint_over(
-            paint_over(glaze, lower_band, paint_solid_color(accent)),
-            upper_band,
-            paint_solid_color(accent),
-        )
+        return _paint_bands(glaze, paint_solid_color(accent), height)
     if kind == "dots":
-        return dots(
-            glaze,
-            accent,
-            cell=sampler(2.6, low=1.6, high=4.0),
-            radius=sampler(0.28, low=0.18, high=0.4),
-        )
+        cell = sampler(2.6, low=1.6, high=4.0)
+        radius = sampler(0.28, low=0.18, high=0.4)
+        return dots(glaze, accent, cell=cell, radius=radius)
     if kind == "stripes":
-        return stripes(
-            clay,
-            accent,
-            cell=sampler(3.0, low=1.5, high=5.0),
-            fraction=sampler(0.4, low=0.2, high=0.6),
-        )
+        cell = sampler(3.0, low=1.5, high=5.0)
+        fraction = sampler(0.4, low=0.2, high=0.6)
+        return stripes(clay, accent, cell=cell, fraction=fraction)
     if kind == "rings":
         return rings(clay, accent, period=sampler(2.0, low=1.0, high=4.0))
     if kind == "speckle":
@@ -330,41 +397,72 @@ def _teapot_decoration(
     return glaze
 
 
+def _paint_bands(glaze: Paint, accent: Paint, height: float) -> Paint:
+    """Paint two bands around a teapot of a height, the upper one narrower."""
+    lower_band = make_range_mask(0.7 * height, 0.74 * height, soft=0.1)
+    upper_band = make_range_mask(0.77 * height, 0.785 * height, soft=0.1)
+    return paint_over(paint_over(glaze, lower_band, accent), upper_band, accent)
+
+
+class _PanSize(NamedTuple):
+    """Measures of a frying pan in centimeters.
+
+    Attributes:
+        base_radius, rim_radius: radii at the bottom and at the rim.
+        depth: height of the rim.
+        wall: thickness of the wall.
+    """
+
+    base_radius: float
+    rim_radius: float
+    depth: float
+    wall: float
+
+
 @make_family(unit_in_metres=0.01)
 def frying_pan(sampler: ParameterSampler) -> Instance:
     """Make a frying pan with a random handle."""
-    base_radius = sampler(10.5, low=9.0, high=11.5)
-    rim_radius = sampler(13.0, low=12.2, high=14.5)
-    depth = sampler(4.2, low=2.8, high=5.5)
-    wall = sampler(0.38, low=0.3, high=0.55)
-    side = shapes.sample_spline(
-        [
-            (base_radius - 0.8, 0.0),
-            (base_radius, 0.25),
-            (base_radius + 0.55 * (rim_radius - base_radius), 0.5 * depth),
-            (rim_radius, depth),
-        ],
-        count=14,
+    size = _PanSize(
+        base_radius=sampler(10.5, low=9.0, high=11.5),
+        rim_radius=sampler(13.0, low=12.2, high=14.5),
+        depth=sampler(4.2, low=2.8, high=5.5),
+        wall=sampler(0.38, low=0.3, high=0.55),
     )
-    body = shapes.make_vessel(side, wall=wall, floor=0.5, columns=64, step=1.6)
-
-    length = sampler(18.0, low=14.0, high=21.0)
-    root = np.array([rim_radius - 0.6, 0.0, 0.78 * depth])
-    rise = sampler(2.6, low=0.6, high=4.5)
-    handle = _pan_handle(sampler, root, length, rise)
-    bracket = _pan_bracket(rim_radius, depth, length, rise)
-    # The bracket goes through the wall at this height.
-    rivet_z = 0.72 * depth
-    rivets = _pan_rivets(shapes.radius_at_height(side, rivet_z) - wall, rivet_z)
-    patches = [*body, *handle, *rivets, *bracket]
+    view_rotation = shapes.make_rotation_matrix("z", VIEW_DEGREES)
+    patches = _pan_patches(sampler, size)
     return Instance(
-        shapes.transform_patches(
-            patches, shapes.make_rotation_matrix("z", VIEW_DEGREES)
-        ),
-        _pan_paints(sampler, rim_radius, depth),
+        shapes.transform_patches(patches, view_rotation),
+        _pan_paints(sampler, size.rim_radius, size.depth),
         sample_material(sampler, roughness=0.38, clearcoat=0.3),
         texel_density={"base": 0.5},
     )
+
+
+def _pan_patches(sampler: ParameterSampler, size: _PanSize) -> list[Patch]:
+    """Create the body of a pan, and its handle along +x with bracket and rivets."""
+    side = _pan_side(size)
+    body = shapes.make_vessel(side, wall=size.wall, floor=0.5, columns=64, step=1.6)
+    length = sampler(18.0, low=14.0, high=21.0)
+    root = np.array([size.rim_radius - 0.6, 0.0, 0.78 * size.depth])
+    rise = sampler(2.6, low=0.6, high=4.5)
+    handle = _pan_handle(sampler, root, length, rise)
+    bracket = _pan_bracket(size.rim_radius, size.depth, length, rise)
+    # The bracket goes through the wall at this height.
+    rivet_z = 0.72 * size.depth
+    rivets = _pan_rivets(shapes.radius_at_height(side, rivet_z) - size.wall, rivet_z)
+    return [*body, *handle, *rivets, *bracket]
+
+
+def _pan_side(size: _PanSize) -> Array:
+    """Return the profile (14, 2), (r, z), of a pan's outside, from bottom to rim."""
+    widening = size.rim_radius - size.base_radius
+    knots = [
+        (size.base_radius - 0.8, 0.0),
+        (size.base_radius, 0.25),
+        (size.base_radius + 0.55 * widening, 0.5 * size.depth),
+        (size.rim_radius, size.depth),
+    ]
+    return shapes.sample_spline(knots, count=14)
 
 
 def _pan_bracket(
@@ -410,6 +508,17 @@ def _pan_handle(
     knots = [(0.0, 0.0), (0.22 * length, 0.55 * rise), (0.6 * length, rise)]
     curve = shapes.to_xz_plane(np.array([*knots, (length, end_rise)]))
     path = shapes.sample_spline(root + curve, count=26)
+    scale = _sample_pan_handle_scale(sampler)
+    # Sections reach from -1 to 1; `scale` makes them as wide as the handle.
+    if sampler.sample_bool(0.5, canonical=True):
+        section = shapes.ellipse(1.0, 1.0, count=20)
+    else:
+        section = shapes.rectangle(2.0, 2.0, bevel=0.7)
+    return shapes.sweep_section("handle", path, section, scale)
+
+
+def _sample_pan_handle_scale(sampler: ParameterSampler) -> Array:
+    """Sample half the thickness and half the width (26, 2) along a pan's handle."""
     t = np.linspace(0.0, 1.0, 26)  # from the root to the end
     max_width = sampler(1.15, low=0.85, high=1.5)
     max_thickness = sampler(0.62, low=0.45, high=0.9)
@@ -424,12 +533,7 @@ def _pan_handle(
     scale = np.stack(
         [max_thickness * relative_thickness, max_width * relative_width], axis=1
     )
-    # Sections reach from -1 to 1; `scale` makes them as wide as the handle.
-    if sampler.sample_bool(0.5, canonical=True):
-        section = shapes.ellipse(1.0, 1.0, count=20)
-    else:
-        section = shapes.rectangle(2.0, 2.0, bevel=0.7)
-    return shapes.sweep_section("handle", path, section, scale * rounding[:, None])
+    return scale * rounding[:, None]
 
 
 def _pan_rivets(radius: float, height: float) -> list[Patch]:
@@ -461,29 +565,30 @@ def _pan_paints(
     enamel = _pan_enamel(sampler, depth, offset)
     outside = choose_paint_or_random(sampler, 2 * rim_radius, enamel, p_random=0.3)
     inside = choose_paint_or_random(sampler, 2 * rim_radius, coating, p_random=0.2)
-    handle_kind = sampler.sample_choice("black", "wood", "colored")
-    # All three are sampled, whichever is used.
-    handle_paints = {
-        "black": paint_solid_color(
-            sampler.sample_color("1b1b1d", "2a2a2c", p_random=0.1)
-        ),
-        "wood": wood(
-            sampler.sample_color("8a5a32", "b98550", p_random=0.0),
-            scale=1.4,
-            offset=offset,
-            axis=0,
-        ),
-        "colored": paint_solid_color(sampler.sample_color("a9231f")),
-    }
+    handle = _sample_pan_handle_paint(sampler, offset)
     steel = paint_solid_color(sampler.sample_color("b9bcc0", "8c8f94", p_random=0.1))
     return {
         "outside": outside,
         "inside": inside,
-        "handle": handle_paints[handle_kind],
+        "handle": handle,
         "rivet": steel,
         "bracket": steel,
         "base": paint_solid_color(sampler.sample_color("77797c", "2b2c2e")),
     }
+
+
+def _sample_pan_handle_paint(sampler: ParameterSampler, offset: Array) -> Paint:
+    """Sample the paint of a pan's handle, with an offset (3,) into the noise.
+
+    The colors of all three kinds are sampled, whichever is used.
+    """
+    kind = sampler.sample_choice("black", "wood", "colored")
+    black = sampler.sample_color("1b1b1d", "2a2a2c", p_random=0.1)
+    timber = sampler.sample_color("8a5a32", "b98550", p_random=0.0)
+    color = sampler.sample_color("a9231f")
+    if kind == "wood":
+        return wood(timber, scale=1.4, offset=offset, axis=0)
+    return paint_solid_color(black if kind == "black" else color)
 
 
 def _pan_coating(sampler: ParameterSampler, offset: Array) -> Paint:

@@ -5,6 +5,8 @@ The bodies are those of `advsearch.scene.people`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -32,6 +34,10 @@ FINISHES = {
     "shoes": assets.Material(roughness=0.4),
     "eyes": assets.Material(roughness=0.1),
 }
+
+
+FACE_X = 0.1
+"""x of the reference body before which the front of the head is, in metres."""
 
 
 def _interpolate_chart(charts: Array, points: Array) -> ChartToPoints:
@@ -66,34 +72,45 @@ def _patches(person: Any) -> list[Patch]:
     vertices = person.standing_points.numpy().astype(np.float64)
     reference = _reference_vertices(data)
     charts = data["charts"].astype(np.float64)
-    faces = data["faces"].astype(np.int64)
-    # Vertices and faces come chart by chart; the data has their counts. These are the
-    # indices of the first ones of each chart.
-    first_vertex = np.cumsum([0, *data["points"]])
-    first_face = np.cumsum([0, *data["triangles"]])
-    # A point of the body at a seam has a vertex in each of its charts.
-    point_of_vertex = data["index"].astype(np.int64)
-    normals = _smooth_normals(
-        vertices, point_of_vertex, faces, first_vertex, first_face
-    )
+    faces_of_chart = _divide_faces(data)
+    normals = _smooth_normals(vertices, data, faces_of_chart)
+    first_vertex = _find_first_indices(data["points"])
     patches = []
     for number, tag in enumerate(data["tags"]):
         in_chart = slice(first_vertex[number], first_vertex[number + 1])
+        width, height = data["sizes"][number][:2]
+        # The paint of a texel depends on its point of the reference body.
+        rest_points = _interpolate_chart(charts[in_chart], reference[in_chart])
         patches.append(
             Patch(
                 tag=str(tag),
                 vertices=vertices[in_chart],
                 normals=normals[in_chart],
                 uvs=charts[in_chart],
-                faces=faces[first_face[number] : first_face[number + 1]],
-                size=(float(data["sizes"][number][0]), float(data["sizes"][number][1])),
-                # The paint of a texel depends on its point of the reference body.
-                compute_rest_points=_interpolate_chart(
-                    charts[in_chart], reference[in_chart]
-                ),
+                faces=faces_of_chart[number],
+                size=(float(width), float(height)),
+                compute_rest_points=rest_points,
             )
         )
     return patches
+
+
+def _find_first_indices(counts: Any) -> assets.IntArray:
+    """Return where each chart begins in an array that has one after another.
+
+    The last of the values (N + 1,) is where all end.
+
+    Args:
+        counts: (N,) number of entries of each chart.
+    """
+    return np.cumsum([0, *counts])
+
+
+def _divide_faces(data: Any) -> list[assets.IntArray]:
+    """Return the faces (F, 3) of each chart, with indices of vertices in the chart."""
+    faces = data["faces"].astype(np.int64)
+    first_face = _find_first_indices(data["triangles"])
+    return [faces[start:end] for start, end in pairwise(first_face)]
 
 
 def _reference_vertices(data: Any) -> Array:
@@ -118,11 +135,7 @@ def _reference_vertices(data: Any) -> Array:
 
 
 def _smooth_normals(
-    vertices: Array,
-    point_of_vertex: assets.IntArray,
-    faces: assets.IntArray,
-    first_vertex: assets.IntArray,
-    first_face: assets.IntArray,
+    vertices: Array, data: Any, faces_of_chart: Sequence[assets.IntArray]
 ) -> Array:
     """Return normals (V, 3) that are smooth across the seams of charts.
 
@@ -133,29 +146,39 @@ def _smooth_normals(
 
     Args:
         vertices: (V, 3), chart after chart.
-        point_of_vertex: (V,) index of the body's point that each vertex is.
-        faces: (F, 3), chart after chart; indices of vertices within the chart.
-        first_vertex, first_face: where the vertices and faces of each chart begin, and
-            where all end.
+        data: the arrays of the file of bodies.
+        faces_of_chart: (F, 3) indices of vertices within the chart, of each chart.
     """
     # indices of vertices within all charts instead of one
-    n_charts = len(first_face) - 1
-    faces_of_chart = [
-        faces[first_face[chart] : first_face[chart + 1]] + first_vertex[chart]
-        for chart in range(n_charts)
-    ]
-    all_faces = np.concatenate(faces_of_chart)
-    # The area vector of a face is added to the sum of each of its three points.
+    first_vertex = _find_first_indices(data["points"])
+    all_faces = np.concatenate(
+        [faces + first_vertex[chart] for chart, faces in enumerate(faces_of_chart)]
+    )
     area_vectors = assets.compute_area_vectors(vertices[all_faces])
-    points_of_faces = point_of_vertex[all_faces]  # (F, 3)
+    # A point of the body at a seam has a vertex in each of its charts.
+    point_of_vertex = data["index"].astype(np.int64)
     n_points = int(point_of_vertex.max()) + 1
+    normal_sum = _sum_by_point(area_vectors, point_of_vertex[all_faces], n_points)
+    normals: Array = normal_sum[point_of_vertex]
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return normals
+
+
+def _sum_by_point(
+    area_vectors: Array, points_of_faces: assets.IntArray, n_points: int
+) -> Array:
+    """Return the sum (P, 3) of the area vectors of the faces around each point.
+
+    Args:
+        area_vectors: (F, 3).
+        points_of_faces: indices of the three points of each face (F, 3).
+        n_points: number P of points.
+    """
     normal_sum = np.zeros((n_points, 3))
     np.add.at(
         normal_sum, points_of_faces.reshape(-1), np.repeat(area_vectors, 3, axis=0)
     )
-    normals = normal_sum[point_of_vertex]
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    return normals
+    return normal_sum
 
 
 @painter
@@ -198,32 +221,42 @@ def _face(t: Texels, color: Array, hair: Array) -> Array:
         color: color of the skin (3,).
         hair: color of the hair (3,).
     """
-    x, y, z = t.xyz.T
-    abs_y = np.abs(y)
-    is_front = x > 0.1
     mottling = 1.0 + 0.1 * (compute_value_noise(t.xyz * 14.0) - 0.5)
     skin = np.clip(color * mottling[:, None], 0.0, 1.0)
-
-    # how far inside an ellipse, as a fraction; -1 at the back of the head
-    in_lips = np.where(is_front, 1.0 - np.hypot(y / 0.025, (z - 1.563) / 0.011), -1.0)
     lip_color = color * np.array([0.86, 0.62, 0.6])
-    skin = blend_colors(
-        skin, lip_color, 0.75 * compute_soft_step(in_lips, 0.0, soft=0.25)
-    )
-
-    in_cheeks = np.where(
-        is_front, 1.0 - np.hypot((abs_y - 0.042) / 0.022, (z - 1.605) / 0.02), -1.0
-    )
+    lips = compute_soft_step(_inside_lips(t), 0.0, soft=0.25)
+    skin = blend_colors(skin, lip_color, 0.75 * lips)
     cheek_color = color * np.array([1.0, 0.84, 0.8])
-    skin = blend_colors(
-        skin, cheek_color, 0.5 * compute_soft_step(in_cheeks, 0.0, soft=0.6)
-    )
+    cheeks = compute_soft_step(_inside_cheeks(t), 0.0, soft=0.6)
+    skin = blend_colors(skin, cheek_color, 0.5 * cheeks)
+    brows = compute_soft_step(_inside_brows(t), 0.0, soft=0.0015)
+    return blend_colors(skin, hair, 0.8 * brows)
 
+
+def _inside_lips(t: Texels) -> Array:
+    """Return how far points (N,) lie inside the lips, as a fraction.
+
+    It is -1 at the back of the head, for lips as for cheeks.
+    """
+    x, y, z = t.xyz.T
+    ellipse_radius = np.hypot(y / 0.025, (z - 1.563) / 0.011)
+    return np.where(x > FACE_X, 1.0 - ellipse_radius, -1.0)
+
+
+def _inside_cheeks(t: Texels) -> Array:
+    """Return how far points (N,) lie inside the cheeks, as a fraction."""
+    x, y, z = t.xyz.T
+    ellipse_radius = np.hypot((np.abs(y) - 0.042) / 0.022, (z - 1.605) / 0.02)
+    return np.where(x > FACE_X, 1.0 - ellipse_radius, -1.0)
+
+
+def _inside_brows(t: Texels) -> Array:
+    """Return how far points (N,) lie inside the eyebrows, in metres; -1 elsewhere."""
+    x, y, z = t.xyz.T
+    abs_y = np.abs(y)
     brow_height = 1.659 - 14.0 * (abs_y - 0.034) ** 2  # an arch over each eye
-    is_above_eye = is_front & (np.abs(abs_y - 0.034) < 0.021)
-    # how far inside a brow, in metres
-    in_brow = np.where(is_above_eye, 0.0038 - np.abs(z - brow_height), -1.0)
-    return blend_colors(skin, hair, 0.8 * compute_soft_step(in_brow, 0.0, soft=0.0015))
+    is_above_eye = (x > FACE_X) & (np.abs(abs_y - 0.034) < 0.021)
+    return np.where(is_above_eye, 0.0038 - np.abs(z - brow_height), -1.0)
 
 
 @painter
@@ -261,17 +294,7 @@ def _irises(t: Texels, color: Array) -> Array:
 @make_family(unit_in_metres=1.0, texels=512)
 def person(sampler: ParameterSampler) -> Instance:
     """Make a person of random phenotype, pose and clothes."""
-    is_woman = sampler.sample_bool(0.5)
-    height_reduction = 0.08 if is_woman else 0.0  # metres
-    phenotype = {
-        "gender": 0.0 if is_woman else 1.0,
-        "height": sampler(1.7, low=1.52, high=1.9) - height_reduction,
-        "weight": sampler(0.5, low=0.25, high=0.8),
-        "age": sampler(35.0, low=16.0, high=75.0),
-        "stride": sampler(0.0, low=0.0, high=1.2),
-        "walk": sampler(0.0, low=0.0, high=360.0),  # phase of the stride, in degrees
-    }
-    body = workbench.library.make_person(phenotype)
+    body = workbench.library.make_person(_sample_phenotype(sampler))
     return Instance(
         _patches(body),
         _person_paints(sampler),
@@ -282,24 +305,36 @@ def person(sampler: ParameterSampler) -> Instance:
     )
 
 
+def _sample_phenotype(sampler: ParameterSampler) -> dict[str, float]:
+    """Sample the properties of a body, and its stride."""
+    is_woman = sampler.sample_bool(0.5)
+    height_reduction = 0.08 if is_woman else 0.0  # metres
+    return {
+        "gender": 0.0 if is_woman else 1.0,
+        "height": sampler(1.7, low=1.52, high=1.9) - height_reduction,
+        "weight": sampler(0.5, low=0.25, high=0.8),
+        "age": sampler(35.0, low=16.0, high=75.0),
+        "stride": sampler(0.0, low=0.0, high=1.2),
+        "walk": sampler(0.0, low=0.0, high=360.0),  # phase of the stride, in degrees
+    }
+
+
+SKINS = ("d9a98a", "e8c3a8", "c68863", "8d5a3a", "5c3a28", "f0cfb4")
+HAIRS = ("2e2019", "120d0a", "5a3a20", "8a6a3c", "9a948c")
+SHIRTS = ("5b86b8", "c8c4ba", "b04038", "3f6b4a", "d0a83e", "2f3338")
+TROUSERS = ("31374a", "4a4640", "1f2226", "6b6152", "5a6270")
+SHOES = ("4a3324", "1d1d1f", "8a8680", "5b2f24")
+IRISES = ("4a3424", "5a7a94", "5f6f4a")
+
+
 def _person_paints(sampler: ParameterSampler) -> dict[str, Paint]:
     """Sample the paints of a person's skin, hair, eyes and clothes, by their tags."""
-    skin = parse_hex_color(
-        sampler.sample_choice(
-            "d9a98a", "e8c3a8", "c68863", "8d5a3a", "5c3a28", "f0cfb4"
-        )
-    )
-    hair = parse_hex_color(
-        sampler.sample_choice("2e2019", "120d0a", "5a3a20", "8a6a3c", "9a948c")
-    )
-    shirt = sampler.sample_color(
-        "5b86b8", "c8c4ba", "b04038", "3f6b4a", "d0a83e", "2f3338"
-    )
-    trousers = sampler.sample_color(
-        "31374a", "4a4640", "1f2226", "6b6152", "5a6270", p_random=0.15
-    )
-    shoes = sampler.sample_color("4a3324", "1d1d1f", "8a8680", "5b2f24", p_random=0.15)
-    irises = parse_hex_color(sampler.sample_choice("4a3424", "5a7a94", "5f6f4a"))
+    skin = parse_hex_color(sampler.sample_choice(*SKINS))
+    hair = parse_hex_color(sampler.sample_choice(*HAIRS))
+    shirt = sampler.sample_color(*SHIRTS)
+    trousers = sampler.sample_color(*TROUSERS, p_random=0.15)
+    shoes = sampler.sample_color(*SHOES, p_random=0.15)
+    irises = parse_hex_color(sampler.sample_choice(*IRISES))
     return {
         "shirt": _woven(shirt, depth=0.16),
         "trousers": _jeans(trousers),

@@ -11,8 +11,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain, pairwise, product
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -311,28 +312,46 @@ def make_grid_patch(
         across: chart coordinate u of the columns (C,), increasing from 0 to 1.
     """
     rows, columns = points.shape[:2]
-    u = np.broadcast_to(across, (rows, columns))
-    v = np.broadcast_to(down[:, None], (rows, columns))
     vertices = points.reshape(-1, 3)
     # `fill_value=None` extrapolates: texels of the gutter lie a little outside of [0,
     # 1].
     interpolate = RegularGridInterpolator(
         (down, across), points, bounds_error=False, fill_value=None
     )
-
-    def compute_rest_points(at_u: Array, at_v: Array) -> Array:
-        """Return the points (N, 3) at chart coordinates (N,)."""
-        return np.asarray(interpolate(np.stack([at_v, at_u], axis=-1)))
-
     return Patch(
         tag=tag,
         vertices=vertices,
         normals=normals.reshape(-1, 3),
-        uvs=np.stack([u, v], axis=-1).reshape(-1, 2),
+        uvs=_grid_uvs(down, across),
         faces=_grid_faces(vertices, rows, columns),
         size=size,
-        compute_rest_points=compute_rest_points,
+        compute_rest_points=partial(_interpolate_points, interpolate),
     )
+
+
+def _interpolate_points(
+    interpolate: Callable[[Array], Any], u: Array, v: Array
+) -> Array:
+    """Return the points (N, 3) at chart coordinates (N,).
+
+    Args:
+        interpolate: returns the points at (N, 2) pairs of v and u.
+        u, v: chart coordinates.
+    """
+    return np.asarray(interpolate(np.stack([v, u], axis=-1)))
+
+
+def _grid_uvs(down: Array, across: Array) -> Array:
+    """Return the chart coordinates (R * C, 2) of a grid, row by row.
+
+    Args:
+        down: chart coordinate v of the rows (R,).
+        across: chart coordinate u of the columns (C,).
+    """
+    grid_size = (len(down), len(across))
+    u = np.broadcast_to(across, grid_size)
+    v = np.broadcast_to(down[:, None], grid_size)
+    return np.stack([u, v], axis=-1).reshape(-1, 2)
 
 
 def _grid_faces(vertices: Array, rows: int, columns: int) -> assets.IntArray:
@@ -377,9 +396,8 @@ def _profile_normals(polylines: Sequence[Array]) -> list[Array]:
     all_directions = [_profile_directions(polyline) for polyline in polylines]
     min_smooth_cosine = np.cos(np.radians(HARD_ANGLE))
     for index in range(len(polylines) - 1):
-        end_point = polylines[index][-1]
-        next_point = polylines[index + 1][0]
-        is_joined = float(np.linalg.norm(end_point - next_point)) < 1e-9
+        gap = polylines[index][-1] - polylines[index + 1][0]
+        is_joined = float(np.linalg.norm(gap)) < 1e-9  # up to rounding
         end_direction = all_directions[index][-1]
         next_direction = all_directions[index + 1][0]
         is_smooth = float(end_direction @ next_direction) > min_smooth_cosine
@@ -424,11 +442,51 @@ def _revolve_curve(curve: Array, theta: Array) -> Array:
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _DiscChart:
+    """Chart of a surface of revolution with a pole: a disc around the pole.
+
+    Attributes:
+        curve: profile (K, 2) of points (r, z), from the pole outwards.
+        radial_fraction: distance of its points from the pole in the chart (K,): the
+            arc length as a fraction.
+        x_sign: -1 if the disc is seen from below, where the x axis has the other
+            direction, else 1.
+    """
+
+    curve: Array
+    radial_fraction: Array
+    x_sign: float
+
+    def compute_uvs(self, theta: Array) -> Array:
+        """Return the chart coordinates (1 + (K - 1) * M, 2) of the pole, then of rings.
+
+        Args:
+            theta: angles about the z axis (M,), in radians.
+        """
+        chart_radius = 0.5 * self.radial_fraction[1:, None]
+        ring_uvs = [
+            0.5 + chart_radius * self.x_sign * np.cos(theta),
+            0.5 + chart_radius * np.sin(theta),
+        ]
+        pole_uv = [[0.5, 0.5]]
+        return np.concatenate([pole_uv, np.stack(ring_uvs, axis=-1).reshape(-1, 2)])
+
+    def compute_points(self, u: Array, v: Array) -> Array:
+        """Return the points (N, 3) at chart coordinates (N,)."""
+        # from [0, 1] to [-1, 1], so that the disc has radius 1 around the pole
+        x = (2 * u - 1) * self.x_sign
+        y = 2 * v - 1
+        # The corners of the chart are outside of the disc and get the color of its rim.
+        pole_distance = np.minimum(np.hypot(x, y), 1.0)
+        radius = np.interp(pole_distance, self.radial_fraction, self.curve[:, 0])
+        z = np.interp(pole_distance, self.radial_fraction, self.curve[:, 1])
+        angle = np.arctan2(y, x)
+        return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1)
+
+
 def _disc(tag: str, profile: Array, normals: Array, columns: int) -> Patch:
     """Create a piece of a surface of revolution that starts or ends on the axis.
-
-    Its chart is a disc with the pole in the middle. The distance from the pole in the
-    chart is the arc length along the profile, as a fraction.
 
     Args:
         tag: tag of the paint.
@@ -440,48 +498,25 @@ def _disc(tag: str, profile: Array, normals: Array, columns: int) -> Patch:
     # 0) faces up, and one that begins there faces down.
     faces_up = profile[-1, 0] < 1e-9
     triangles = _disc_triangles(columns, profile)
+    x_sign = 1.0
     if faces_up:
         # the same points, but from the pole outwards
-        curve = profile[::-1]
-        curve_normals = normals[::-1]
-        chart_x_sign = 1.0
+        profile = profile[::-1]
+        normals = normals[::-1]
     else:
-        curve = profile
-        curve_normals = normals
-        # Seen from below, the x axis has the other direction.
-        chart_x_sign = -1.0
+        x_sign = -1.0
         triangles = triangles[:, ::-1]
-
-    radial_fraction, length = _compute_length_fractions(curve)
+    radial_fraction, length = _compute_length_fractions(profile)
+    chart = _DiscChart(profile, radial_fraction, x_sign)
     theta = 2 * np.pi * np.arange(columns) / columns
-    chart_radius = 0.5 * radial_fraction[1:, None]
-    ring_uvs = [
-        0.5 + chart_radius * chart_x_sign * np.cos(theta),
-        0.5 + chart_radius * np.sin(theta),
-    ]
-    pole_uv = [[0.5, 0.5]]
-    uvs = np.concatenate([pole_uv, np.stack(ring_uvs, axis=-1).reshape(-1, 2)])
-
-    def compute_rest_points(u: Array, v: Array) -> Array:
-        """Return the points (N, 3) at chart coordinates (N,)."""
-        # from [0, 1] to [-1, 1], so that the disc has radius 1 around the pole
-        x = (2 * u - 1) * chart_x_sign
-        y = 2 * v - 1
-        # The corners of the chart are outside of the disc and get the color of its rim.
-        pole_distance = np.minimum(np.hypot(x, y), 1.0)
-        radius = np.interp(pole_distance, radial_fraction, curve[:, 0])
-        z = np.interp(pole_distance, radial_fraction, curve[:, 1])
-        angle = np.arctan2(y, x)
-        return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1)
-
     return Patch(
         tag=tag,
-        vertices=_revolve_from_pole(curve, theta),
-        normals=_revolve_from_pole(curve_normals, theta),
-        uvs=uvs,
+        vertices=_revolve_from_pole(profile, theta),
+        normals=_revolve_from_pole(normals, theta),
+        uvs=chart.compute_uvs(theta),
         faces=triangles,
         size=(2 * length, 2 * length),  # `length` is the radius of the unrolled disc
-        compute_rest_points=compute_rest_points,
+        compute_rest_points=chart.compute_points,
     )
 
 
@@ -540,22 +575,32 @@ def _wall(tag: str, profile: Array, normals: Array, columns: int) -> list[Patch]
     # The circumference at the upper quartile of the radii. That at the largest radius
     # would depend on single points, such as a lip.
     width = 2 * np.pi * float(np.quantile(profile[:, 0], 0.75))
-    can_be_quartered = columns % 4 == 0
-    n_pieces = 1
-    if width > 6 * length and can_be_quartered:
-        n_pieces = 4
-    elif width > 3 * length:
-        n_pieces = 2
+    n_pieces = _count_wall_charts(width, length, columns)
     piece_columns = columns // n_pieces
     across = np.arange(piece_columns + 1) / piece_columns
     size = (width / n_pieces, length)
-    patches = []
-    for start in range(0, piece_columns * n_pieces, piece_columns):
-        piece = np.s_[:, start : start + piece_columns + 1]
-        patches.append(
-            make_grid_patch(tag, points[piece], normal[piece], size, down, across)
-        )
-    return patches
+    pieces = [
+        np.s_[:, start : start + piece_columns + 1]
+        for start in range(0, piece_columns * n_pieces, piece_columns)
+    ]
+    return [
+        make_grid_patch(tag, points[piece], normal[piece], size, down, across)
+        for piece in pieces
+    ]
+
+
+def _count_wall_charts(width: float, length: float, columns: int) -> int:
+    """Return the number of charts that a band is cut into.
+
+    Args:
+        width: circumference of the band.
+        length: its length from one edge to the other.
+        columns: faces around it.
+    """
+    can_be_quartered = columns % 4 == 0
+    if width > 6 * length and can_be_quartered:
+        return 4
+    return 2 if width > 3 * length else 1
 
 
 def revolve_profile(
@@ -574,17 +619,22 @@ def revolve_profile(
     curves = [np.asarray(curve, dtype=np.float64) for _, curve in profile]
     patches = []
     for tag, curve, normals in zip(tags, curves, _profile_normals(curves), strict=True):
-        starts_on_axis = curve[0, 0] < 1e-9  # a radius of 0, up to rounding
-        ends_on_axis = curve[-1, 0] < 1e-9
-        has_single_pole = starts_on_axis != ends_on_axis
-        radius_change = abs(curve[-1, 0] - curve[0, 0])
-        _, length = _compute_length_fractions(curve)
-        is_mostly_flat = radius_change > 0.5 * length
-        if has_single_pole and is_mostly_flat:
+        if _becomes_disc(curve):
             patches.append(_disc(tag, curve, normals, columns))
         else:
             patches += _wall(tag, curve, normals, columns)
     return patches
+
+
+def _becomes_disc(curve: Array) -> bool:
+    """Return whether a profile (K, 2) is mostly flat, with one of its ends on the axis."""
+    starts_on_axis = curve[0, 0] < 1e-9  # a radius of 0, up to rounding
+    ends_on_axis = curve[-1, 0] < 1e-9
+    has_single_pole = starts_on_axis != ends_on_axis
+    radius_change = abs(curve[-1, 0] - curve[0, 0])
+    _, length = _compute_length_fractions(curve)
+    is_mostly_flat = radius_change > 0.5 * length
+    return bool(has_single_pole and is_mostly_flat)
 
 
 def make_vessel(
@@ -604,10 +654,7 @@ def make_vessel(
     """
     normal, inner = _inner_profile(outside, wall)  # `inner` is from the lip downwards
     lip = _round_lip(outside, wall, normal)
-    max_radius = float(outside[:, 0].max())
-    fillet = min(1.5 * wall, 0.3 * max_radius)  # radius between wall and floor
-    is_open = inner[:, 0] > 0.05 * max_radius  # not where a narrow inside closes
-    inside = _round_floor_edge(inner, is_open, fillet, floor)
+    inside = _vessel_inside(outside, inner, wall, floor)
     fillet_end = inside[-1]
     outside_with_lip = np.concatenate([outside, lip, inside[:1]])
     base = _hollow_base(outside[0], wall, floor)
@@ -618,6 +665,21 @@ def make_vessel(
         ("inside", subdivide([fillet_end, (0.0, floor)], longest=3 * step)),
     ]
     return revolve_profile(pieces, columns=columns)
+
+
+def _vessel_inside(outside: Array, inner: Array, wall: float, floor: float) -> Array:
+    """Return the profile of a container's inside, from the lip to the rounded floor edge.
+
+    Args:
+        outside: profile (K, 2) of the outside.
+        inner: profile (L, 2) of the inside without a floor, from the lip downwards.
+        wall: thickness of the wall.
+        floor: height of the floor.
+    """
+    max_radius = float(outside[:, 0].max())
+    fillet = min(1.5 * wall, 0.3 * max_radius)  # radius between wall and floor
+    is_open = inner[:, 0] > 0.05 * max_radius  # not where a narrow inside closes
+    return _round_floor_edge(inner, is_open, fillet, floor)
 
 
 def _round_floor_edge(
@@ -790,33 +852,52 @@ def sweep_section(
     tangent, first_normal, second_normal = frame
     scales = _to_axis_scales(scale, len(centers))
     points = _sweep_points(section, scales, centers, first_normal, second_normal)
+    ring_fraction, width = _measure_rings(section, scales)
+    # distance along the path of each ring
+    down = mean_lengths(points)
+    # The first column of the chart is repeated as the last one.
+    side = make_grid_patch(
+        tag,
+        _repeat_first(points, axis=1),
+        _repeat_first(_sweep_normals(points, tangent), axis=1),
+        size=(width, float(down[-1])),
+        down=down / down[-1],
+        across=ring_fraction,
+    )
+    return [side, *_sweep_caps(tag, points, tangent)] if has_caps else [side]
+
+
+def _measure_rings(section: Array, scales: Array) -> tuple[Array, float]:
+    """Return the chart coordinates of a closed section, and the width of its chart.
+
+    The coordinates (M + 1,) are those of its points (M, 2), and of the first one again.
+
+    Args:
+        section: the section.
+        scales: its scales (N, 2) along the path.
+    """
     closed_section = _repeat_first(section, axis=0)
     ring_fraction, ring_length = _compute_length_fractions(closed_section)
     # The circumference at the upper quartile of the scales, so that the ends, which may
     # shrink to a point, hardly matter.
     width = ring_length * float(np.quantile(scales.mean(axis=1), 0.75))
-    # distance along the path of each ring
-    down = mean_lengths(points)
-    normals = _sweep_normals(points, tangent)
-    # The first column of the chart is repeated as the last one.
-    patches = [
-        make_grid_patch(
-            tag,
-            _repeat_first(points, axis=1),
-            _repeat_first(normals, axis=1),
-            size=(width, float(down[-1])),
-            down=down / down[-1],
-            across=ring_fraction,
-        )
+    return ring_fraction, width
+
+
+def _sweep_caps(tag: str, points: Array, tangent: Array) -> list[Patch]:
+    """Create the flat faces at both ends of a swept surface.
+
+    Args:
+        tag: tag of the paint.
+        points: points (N, M, 3), ring by ring.
+        tangent: unit tangents (N, 3) of the path.
+    """
+    # Rings are counter-clockwise seen from the end of the path. The first face is
+    # seen from the other side, so its ring is reversed.
+    return [
+        make_cap_face(tag, points[0][::-1], -tangent[0]),
+        make_cap_face(tag, points[-1], tangent[-1]),
     ]
-    if has_caps:
-        # Rings are counter-clockwise seen from the end of the path. The first face is
-        # seen from the other side, so its ring is reversed.
-        patches += [
-            make_cap_face(tag, points[0][::-1], -tangent[0]),
-            make_cap_face(tag, points[-1], tangent[-1]),
-        ]
-    return patches
 
 
 def _to_axis_scales(scale: Array | Sequence[float] | float, count: int) -> Array:
@@ -892,35 +973,56 @@ def make_cap_face(tag: str, ring: Array, normal: Array) -> Patch:
     the ring.
     """
     center = ring.mean(axis=0)
-    # axes of the plane; the first is made exactly perpendicular to the normal
-    to_first = normalize(ring[0] - center)
-    x_axis = normalize(to_first - (to_first @ normal) * normal)
+    x_axis = _make_perpendicular(normalize(ring[0] - center), normal)
     y_axis = np.cross(normal, x_axis)
     plane_points = np.stack(
         [(ring - center) @ x_axis, (ring - center) @ y_axis], axis=1
     )
-    lower = plane_points.min(axis=0)
-    extent = plane_points.max(axis=0) - plane_points.min(axis=0)
+    chart = _PlaneChart(
+        center, x_axis, y_axis, plane_points.min(axis=0), np.ptp(plane_points, axis=0)
+    )
     vertices = np.concatenate([center[None], ring])
     plane_vertices = np.concatenate([[[0.0, 0.0]], plane_points])
-
-    def compute_rest_points(u: Array, v: Array) -> Array:
-        """Return the points (N, 3) at chart coordinates (N,)."""
-        return np.asarray(
-            center
-            + (u * extent[0] + lower[0])[:, None] * x_axis
-            + (v * extent[1] + lower[1])[:, None] * y_axis
-        )
-
     return Patch(
         tag=tag,
         vertices=vertices,
         normals=np.tile(normal, (len(vertices), 1)),
-        uvs=(plane_vertices - lower) / extent,
+        uvs=(plane_vertices - chart.lower) / chart.extent,
         faces=_fan(len(ring)),
-        size=(float(extent[0]), float(extent[1])),
-        compute_rest_points=compute_rest_points,
+        size=(float(chart.extent[0]), float(chart.extent[1])),
+        compute_rest_points=chart.compute_points,
     )
+
+
+def _make_perpendicular(direction: Array, normal: Array) -> Array:
+    """Return a unit direction (3,) made exactly perpendicular to a unit normal (3,)."""
+    return normalize(direction - (direction @ normal) * normal)
+
+
+@dataclass(frozen=True, eq=False)
+class _PlaneChart:
+    """Chart of a flat face: a rectangle in its plane.
+
+    Attributes:
+        center: origin (3,) of coordinates in the plane.
+        x_axis, y_axis: unit vectors (3,).
+        lower: lower left corner of the rectangle (2,).
+        extent: width and height of the rectangle (2,).
+    """
+
+    center: Array
+    x_axis: Array
+    y_axis: Array
+    lower: Array
+    extent: Array
+
+    def compute_points(self, u: Array, v: Array) -> Array:
+        """Return the points (N, 3) at chart coordinates (N,)."""
+        return np.asarray(
+            self.center
+            + (u * self.extent[0] + self.lower[0])[:, None] * self.x_axis
+            + (v * self.extent[1] + self.lower[1])[:, None] * self.y_axis
+        )
 
 
 def make_rounded_box(
@@ -950,32 +1052,96 @@ def make_rounded_box(
         _edge_coordinates(float(half_length), bevel, steps, cells)
         for half_length in flat
     ]
-    patches = []
-    for axis, side in product(range(3), (1.0, -1.0)):
+    box = _RoundedBox(np.asarray(center, dtype=np.float64), half, bevel, coordinates)
+    return [
+        box.make_face(tag, axis, side) for axis, side in product(range(3), (1.0, -1.0))
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class _RoundedBox:
+    """A box with rounded edges.
+
+    Attributes:
+        center: its center (3,).
+        half: half its size (3,).
+        bevel: radius of its edges.
+        coordinates: coordinates of the grid of its faces along each axis, relative to
+            the center.
+    """
+
+    center: Array
+    half: Array
+    bevel: float
+    coordinates: Sequence[Array]
+
+    def make_face(self, tag: str, axis: int, side: float) -> Patch:
+        """Create a face.
+
+        Args:
+            tag: tag of the paint.
+            axis: axis that the face is perpendicular to: 0, 1 or 2.
+            side: 1 for the upper face, -1 for the lower one.
+        """
         # the two axes of the face: columns follow i (chart coordinate u), rows j (v)
         i = (axis + 1) % 3
         j = (axis + 2) % 3
-        normals, points = _rounded_face(
-            axis, side, coordinates[i], coordinates[j], half, bevel
-        )
-        # from coordinates in [-half, half] to [0, 1]
-        down = (coordinates[j] + half[j]) / (2 * half[j])
-        across = (coordinates[i] + half[i]) / (2 * half[i])
+        normals, points = self._compute_face(axis, side)
+        across = self._to_chart(i)
         if side < 0:
-            # `_rounded_face` returns the columns of a lower face in reverse order. Its u
-            # is counted from the other side, so that it increases, too.
+            # The columns of a lower face have the reverse order. Its u is counted from
+            # the other side, so that it increases, too.
             across = 1.0 - across[::-1]
-        patches.append(
-            make_grid_patch(
-                tag,
-                points + np.asarray(center, dtype=np.float64),
-                normals,
-                size=(2 * float(half[i]), 2 * float(half[j])),
-                down=down,
-                across=across,
-            )
+        return make_grid_patch(
+            tag,
+            points + self.center,
+            normals,
+            size=(2 * float(self.half[i]), 2 * float(self.half[j])),
+            down=self._to_chart(j),
+            across=across,
         )
-    return patches
+
+    def _to_chart(self, axis: int) -> Array:
+        """Return the coordinates along an axis in [0, 1] instead of [-half, half]."""
+        half = self.half[axis]
+        return np.asarray((self.coordinates[axis] + half) / (2 * half))
+
+    def _compute_face(self, axis: int, side: float) -> tuple[Array, Array]:
+        """Return normals and points (V, U, 3) of a face, around the center of the box.
+
+        The core is the box made smaller by the bevel on each side. Each point is at the
+        distance `bevel` from the core, between a point on the face of the sharp box and
+        the nearest point of the core.
+
+        Args:
+            axis: axis that the face is perpendicular to: 0, 1 or 2.
+            side: 1 for the upper face, -1 for the lower one.
+        """
+        core = self.half - self.bevel
+        sharp_points = self._compute_sharp_face(axis)
+        core_points = np.clip(sharp_points, -core, core)
+        normals = normalize(sharp_points - core_points)
+        points = core_points + self.bevel * normals
+        if side < 0:
+            # The upper face, rotated by 180 degrees about the axis of v, is the lower
+            # one. A rotation, unlike a mirroring, leaves its front outside.
+            points = points[:, ::-1].copy()
+            normals = normals[:, ::-1].copy()
+            points[..., axis] *= -1.0
+            normals[..., axis] *= -1.0
+        return normals, points
+
+    def _compute_sharp_face(self, axis: int) -> Array:
+        """Return the points (V, U, 3) of the upper face of the box without rounding."""
+        i = (axis + 1) % 3
+        j = (axis + 2) % 3
+        u = self.coordinates[i]
+        v = self.coordinates[j]
+        points = np.empty((len(v), len(u), 3))
+        points[..., axis] = self.half[axis]
+        points[..., i] = u[None]
+        points[..., j] = v[:, None]
+        return points
 
 
 def _edge_coordinates(flat: float, bevel: float, steps: int, cells: int) -> Array:
@@ -996,40 +1162,6 @@ def _edge_coordinates(flat: float, bevel: float, steps: int, cells: int) -> Arra
     lower_edge = -upper_edge[::-1]
     flat_part = np.linspace(-flat, flat, cells + 1)
     return np.concatenate([lower_edge, flat_part, upper_edge])
-
-
-def _rounded_face(
-    axis: int, side: float, u: Array, v: Array, half: Array, bevel: float
-) -> tuple[Array, Array]:
-    """Return normals and points (V, U, 3) of a face of a box with rounded edges.
-
-    The core is the box made smaller by the bevel on each side. Each point is at the
-    distance `bevel` from the core, between a point on the face of the sharp box and the
-    nearest point of the core.
-
-    Args:
-        axis: axis that the face is perpendicular to: 0, 1 or 2.
-        side: 1 for the upper face, -1 for the lower one.
-        u, v: coordinates (U,) and (V,) along the next two axes, `axis` + 1 and + 2.
-        half: half the size of the box (3,).
-        bevel: radius of the edges.
-    """
-    core = half - bevel
-    sharp_points = np.empty((len(v), len(u), 3))
-    sharp_points[..., axis] = half[axis]
-    sharp_points[..., (axis + 1) % 3] = u[None]
-    sharp_points[..., (axis + 2) % 3] = v[:, None]
-    core_points = np.clip(sharp_points, -core, core)
-    normals = normalize(sharp_points - core_points)
-    points = core_points + bevel * normals
-    if side < 0:
-        # The upper face, rotated by 180 degrees about the axis of v, is the lower one.
-        # A rotation, unlike a mirroring, leaves its front outside.
-        points = points[:, ::-1].copy()
-        normals = normals[:, ::-1].copy()
-        points[..., axis] *= -1.0
-        normals[..., axis] *= -1.0
-    return normals, points
 
 
 # ---- cutting
@@ -1067,19 +1199,30 @@ def carve_patches(
     for patch in patches:
         value = _snap_to_vertices(patch, np.array(inside(patch.vertices)))
         has_inside = value.max() > 0.0
-        if not has_inside:
+        if has_inside:
+            carved_patches += _cut_patch(patch, value, tag)
+        else:
             carved_patches.append(patch)
-            continue
-        cut, is_inside = _split(patch, value)
-        for faces, part_tag in (
-            (cut.faces[~is_inside], patch.tag),
-            (cut.faces[is_inside], tag),
-        ):
-            if len(faces) and part_tag is not None:
-                carved_patches.append(
-                    crop_chart(replace(cut, faces=faces, tag=part_tag))
-                )
     return carved_patches
+
+
+def _cut_patch(patch: Patch, value: Array, tag: str | None) -> list[Patch]:
+    """Cut a patch into what is outside and what is inside; parts without faces are none.
+
+    Args:
+        patch: the patch.
+        value: values at its vertices (V,), positive inside.
+        tag: tag of the inside; None removes the inside.
+    """
+    cut, is_inside = _split(patch, value)
+    parts = []
+    for faces, part_tag in (
+        (cut.faces[~is_inside], patch.tag),
+        (cut.faces[is_inside], tag),
+    ):
+        if len(faces) and part_tag is not None:
+            parts.append(crop_chart(replace(cut, faces=faces, tag=part_tag)))
+    return parts
 
 
 def _snap_to_vertices(patch: Patch, value: Array) -> Array:
@@ -1111,19 +1254,26 @@ def crop_chart(patch: Patch) -> Patch:
     lower = used_uvs.min(axis=0)
     extent = np.ptp(used_uvs, axis=0)
     width, height = patch.size
-
-    def compute_rest_points(u: Array, v: Array) -> Array:
-        """Return the points (N, 3) at coordinates (N,) of the cropped chart."""
-        return patch.compute_rest_points(
-            lower[0] + u * extent[0], lower[1] + v * extent[1]
-        )
-
     return replace(
         patch,
         uvs=np.clip((patch.uvs - lower) / extent, 0.0, 1.0),
         size=(width * float(extent[0]), height * float(extent[1])),
-        compute_rest_points=compute_rest_points,
+        compute_rest_points=partial(_compute_cropped_points, patch, lower, extent),
     )
+
+
+def _compute_cropped_points(
+    patch: Patch, lower: Array, extent: Array, u: Array, v: Array
+) -> Array:
+    """Return the points (N, 3) at coordinates (N,) of a part of a patch's chart.
+
+    Args:
+        patch: patch with the full chart.
+        lower: lower left corner (2,) of the part, in chart coordinates.
+        extent: width and height (2,) of the part, in chart coordinates.
+        u, v: coordinates in the part, in [0, 1].
+    """
+    return patch.compute_rest_points(lower[0] + u * extent[0], lower[1] + v * extent[1])
 
 
 def _edges(patch: Patch) -> assets.IntArray:
@@ -1140,6 +1290,39 @@ def _are_crossed(edges: assets.IntArray, value: Array) -> assets.BoolArray:
     return is_crossed
 
 
+@dataclass(frozen=True, eq=False)
+class _EdgeCuts:
+    """New vertices where edges of a patch are cut.
+
+    Attributes:
+        first, second: indices of the ends of each edge (E,).
+        fraction: where the cut is, as a fraction of the edge from its first end (E, 1).
+    """
+
+    first: assets.IntArray
+    second: assets.IntArray
+    fraction: Array
+
+    @classmethod
+    def at_zero(cls, edges: assets.IntArray, value: Array) -> _EdgeCuts:
+        """Cut edges (E, 2) where the value is 0, which has different signs at both ends.
+
+        Args:
+            edges: indices of vertices.
+            value: value of each vertex (V,).
+        """
+        first, second = edges.T
+        # value(first) + fraction * (value(second) - value(first)) = 0
+        fraction = (value[first] / (value[first] - value[second]))[:, None]
+        return cls(first, second, fraction)
+
+    def add_to(self, attribute: Array) -> Array:
+        """Return an attribute (V, k) of the vertices, then of the cuts."""
+        difference = attribute[self.second] - attribute[self.first]
+        cut_attribute = attribute[self.first] + self.fraction * difference
+        return np.concatenate([attribute, cut_attribute])
+
+
 def _split(patch: Patch, value: Array) -> tuple[Patch, assets.BoolArray]:
     """Split the triangles of a patch where the values (V,) of its vertices change sign.
 
@@ -1151,33 +1334,36 @@ def _split(patch: Patch, value: Array) -> tuple[Patch, assets.BoolArray]:
     """
     edges = _edges(patch)
     crossed_edges = edges[_are_crossed(edges, value)]
-    first, second = crossed_edges.T
-    # The cut is where the value is 0, at a fraction of the edge from its first vertex:
-    # value(first) + fraction * (value(second) - value(first)) = 0.
-    fraction = (value[first] / (value[first] - value[second]))[:, None]
-
-    def add_cuts(attribute: Array) -> Array:
-        """Return an attribute (V, k) of the vertices, then of the cuts."""
-        difference = attribute[second] - attribute[first]
-        return np.concatenate([attribute, attribute[first] + fraction * difference])
-
-    normals = add_cuts(patch.normals)
+    cuts = _EdgeCuts.at_zero(crossed_edges, value)
+    normals = cuts.add_to(patch.normals)
     # Interpolated normals are shorter than 1. They are normalized in place.
     cut_normals = normals[len(patch.normals) :]
     cut_normals /= np.linalg.norm(cut_normals, axis=1, keepdims=True)
-    cut_of_edge = {
-        (int(start), int(end)): len(patch.vertices) + index
-        for index, (start, end) in enumerate(crossed_edges)
-    }
+    cut_of_edge = _number_cuts(crossed_edges, first=len(patch.vertices))
     faces, is_inside = _split_faces(patch, value, cut_of_edge)
     split_patch = replace(
         patch,
-        vertices=add_cuts(patch.vertices),
+        vertices=cuts.add_to(patch.vertices),
         normals=normals,
-        uvs=add_cuts(patch.uvs),
+        uvs=cuts.add_to(patch.uvs),
         faces=np.array(faces),
     )
     return split_patch, np.array(is_inside)
+
+
+def _number_cuts(
+    crossed_edges: assets.IntArray, first: int
+) -> dict[tuple[int, int], int]:
+    """Return the index of the new vertex of each edge, by the indices of its ends.
+
+    Args:
+        crossed_edges: (E, 2) ends of the edges that are cut.
+        first: index of the first new vertex.
+    """
+    return {
+        (int(start), int(end)): first + index
+        for index, (start, end) in enumerate(crossed_edges)
+    }
 
 
 def _split_faces(
@@ -1201,14 +1387,25 @@ def _split_faces(
             is_inside.append(bool(face_values.sum() > 0.0))
             continue
         outline = _outline_with_cuts(face, value, cut_of_edge)
-        # Vertices with the value 0, such as the cuts, belong to both parts.
-        inside_part = [vertex for vertex, at_vertex in outline if at_vertex >= 0.0]
-        outside_part = [vertex for vertex, at_vertex in outline if at_vertex <= 0.0]
-        for part, part_is_inside in ((inside_part, True), (outside_part, False)):
-            triangles = _divide_polygon(part)
-            faces += triangles
-            is_inside += [part_is_inside] * len(triangles)
+        inside_triangles, outside_triangles = _divide_outline(outline)
+        faces += [*inside_triangles, *outside_triangles]
+        is_inside += [True] * len(inside_triangles) + [False] * len(outside_triangles)
     return faces, is_inside
+
+
+def _divide_outline(
+    outline: Sequence[tuple[int, float]],
+) -> tuple[list[tuple[int, int, int]], list[tuple[int, int, int]]]:
+    """Divide a triangle with cuts into triangles inside and outside.
+
+    Vertices with the value 0, such as the cuts, belong to both parts.
+
+    Args:
+        outline: index and value of each vertex around the triangle.
+    """
+    inside_part = [vertex for vertex, at_vertex in outline if at_vertex >= 0.0]
+    outside_part = [vertex for vertex, at_vertex in outline if at_vertex <= 0.0]
+    return _divide_polygon(inside_part), _divide_polygon(outside_part)
 
 
 def _divide_polygon(corners: Sequence[int]) -> list[tuple[int, int, int]]:

@@ -80,14 +80,19 @@ class ParameterSampler:
         if rng is None:
             return parse_hex_color(canonical)
         if rng.random() < p_random:
-            hue = rng.random()
-            saturation = rng.random() ** 0.7  # saturated colors a little more often
-            value = rng.uniform(0.15, 0.97)  # no black
-            return np.array(colorsys.hsv_to_rgb(hue, saturation, value))
+            return _sample_any_color(rng)
         base = parse_hex_color(self.sample_choice(canonical, *others))
         brightness = rng.uniform(0.85, 1.12)
         tint = rng.uniform(-0.05, 0.05, 3)
         return np.clip(base * brightness + tint, 0.02, 0.98)
+
+
+def _sample_any_color(rng: np.random.Generator) -> Color:
+    """Sample a color of any hue; saturated colors a little more often, and no black."""
+    hue = rng.random()
+    saturation = rng.random() ** 0.7
+    value = rng.uniform(0.15, 0.97)
+    return np.array(colorsys.hsv_to_rgb(hue, saturation, value))
 
 
 Options = ParamSpec("Options")
@@ -257,21 +262,31 @@ def wood(
     stretch = np.full(3, 1.0 / scale)
     stretch[axis] = 0.12 / scale  # the grain is long along the axis
     grain_position = t.xyz * stretch + offset
+    growth_rings = _compute_growth_rings(grain_position, axis)
+    # fibers are four times as fine across the axis as the rings are
+    is_axis = np.arange(3) == axis
+    fibers = compute_value_noise(grain_position * np.where(is_axis, 1.0, 4.0))
+    grain = contrast * (0.55 * growth_rings**2 + 0.45 * fibers)
+    brightening = 1.12  # makes up for some of what the grain darkens
+    return np.asarray(np.clip(color * (1.0 - grain)[:, None] * brightening, 0.0, 1.0))
+
+
+def _compute_growth_rings(grain_position: Array, axis: int) -> Array:
+    """Return a wave (N,) in [0, 1] across wood, with a period at each growth ring.
+
+    It is a slanted plane wave that is bent by noise. The factors are chosen by eye.
+
+    Args:
+        grain_position: points (N, 3), in units of the distance of the rings.
+        axis: axis of the fibers.
+    """
     first_cross, second_cross = (i for i in range(3) if i != axis)
-    # Growth rings are a slanted plane wave that is bent by noise. The factors here and
-    # below are chosen by eye.
     ring_phase = (
         grain_position[:, first_cross]
         + 0.6 * grain_position[:, second_cross]
         + 1.6 * compute_value_noise(grain_position * 0.45)
     )
-    rings = 0.5 + 0.5 * np.sin(2 * np.pi * ring_phase * 0.8)
-    # fibers are four times as fine across the axis as the rings are
-    is_axis = np.arange(3) == axis
-    fibers = compute_value_noise(grain_position * np.where(is_axis, 1.0, 4.0))
-    grain = contrast * (0.55 * rings**2 + 0.45 * fibers)
-    brightening = 1.12  # makes up for some of what the grain darkens
-    return np.asarray(np.clip(color * (1.0 - grain)[:, None] * brightening, 0.0, 1.0))
+    return np.asarray(0.5 + 0.5 * np.sin(2 * np.pi * ring_phase * 0.8))
 
 
 @painter
@@ -403,6 +418,21 @@ def make_facing_mask(
     return weight
 
 
+PAINT_KINDS = (
+    "solid",
+    "rings",
+    "stripes",
+    "checks",
+    "dots",
+    "zigzag",
+    "mottled",
+    "speckled",
+    "gradient",
+    "wood",
+)
+"""Kinds of paints that `sample_paint` samples."""
+
+
 def sample_paint(sampler: ParameterSampler, size: float) -> Paint:
     """Sample a paint of any kind and colors.
 
@@ -418,38 +448,37 @@ def sample_paint(sampler: ParameterSampler, size: float) -> Paint:
     b = sampler.sample_color("808080", p_random=1.0)
     cell = size * sampler(0.1, low=0.05, high=0.2)
     offset = sampler.sample_noise_offset()
-    kind = sampler.sample_choice(
-        "solid",
-        "rings",
-        "stripes",
-        "checks",
-        "dots",
-        "zigzag",
-        "mottled",
-        "speckled",
-        "gradient",
-        "wood",
-    )
+    kind = sampler.sample_choice(*PAINT_KINDS)
     if kind in ("mottled", "speckled", "wood"):
         return _sample_irregular_paint(sampler, kind, a, b, cell, offset)
     if kind in ("rings", "gradient"):
         return _sample_paint_along_axis(sampler, kind, a, b, cell, size)
+    if kind in ("stripes", "dots", "checks", "zigzag"):
+        return _sample_chart_pattern(sampler, kind, a, b, cell)
+    return paint_solid_color(a)
+
+
+def _sample_chart_pattern(
+    sampler: ParameterSampler, kind: str, a: Color, b: Color, cell: float
+) -> Paint:
+    """Sample a regular pattern of two colors in chart coordinates.
+
+    Args:
+        sampler: samples the proportions.
+        kind: "stripes", "dots", "checks" or "zigzag".
+        a, b: colors (3,).
+        cell: width that the pattern is scaled by.
+    """
     if kind == "stripes":
-        return stripes(
-            a,
-            b,
-            cell=cell,
-            fraction=sampler(0.5, low=0.2, high=0.8),
-            slant=int(sampler.sample_choice(0, 1, 3)),
-        )
+        fraction = sampler(0.5, low=0.2, high=0.8)
+        slant = int(sampler.sample_choice(0, 1, 3))
+        return stripes(a, b, cell=cell, fraction=fraction, slant=slant)
     if kind == "dots":
         radius = sampler(0.3, low=0.18, high=0.42)
         return dots(paint_solid_color(a), b, cell=cell, radius=radius)
     if kind == "checks":
         return checks(a, b, cell=cell)
-    if kind == "zigzag":
-        return zigzag(a, b, cell=cell)
-    return paint_solid_color(a)
+    return zigzag(a, b, cell=cell)
 
 
 def _sample_irregular_paint(

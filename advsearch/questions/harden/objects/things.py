@@ -65,6 +65,7 @@ at a distance of 1.
 HEXAGON_DISTANCE = 0.9149
 """The same of its hexagons."""
 BANANA_POINTS = 44  # points of the path of a banana
+BANANA_BROWN = "6b4520"  # color of flecks and of the stem
 COVER_SHIFT = 0.25
 """Distance of the covers' middle from the origin of a book, along +x."""
 
@@ -191,15 +192,22 @@ def ball(sampler: ParameterSampler) -> Instance:
     dark = sampler.sample_color("1d1f22", "23395d", "b5442e", p_random=0.3)
     paint = _ball_paint(sampler, style, light, dark, radius, offset)
     sphere = shapes.make_sphere_patches("ball", radius, rows=28, columns=48)
-    patches = [
-        replace(patch, vertices=patch.vertices * np.array([1.0, 1.0, squash]))
-        for patch in shapes.transform_patches(
-            _press_ball(sphere, style, radius), about_z @ about_x
-        )
-    ]
-    return Instance(
-        patches, {"ball": paint}, sample_material(sampler, roughness=0.4, clearcoat=0.3)
+    rotated = shapes.transform_patches(
+        _press_ball(sphere, style, radius), about_z @ about_x
     )
+    return Instance(
+        _squash(rotated, squash),
+        {"ball": paint},
+        sample_material(sampler, roughness=0.4, clearcoat=0.3),
+    )
+
+
+def _squash(patches: list[Patch], factor: float) -> list[Patch]:
+    """Scale the vertices of patches along z; normals stay as they are."""
+    return [
+        replace(patch, vertices=patch.vertices * np.array([1.0, 1.0, factor]))
+        for patch in patches
+    ]
 
 
 def _press_ball(sphere: list[Patch], style: str, radius: float) -> list[Patch]:
@@ -243,28 +251,37 @@ def _ball_paint(
     if style == "beach":
         return _beach(_beach_colors(sampler, light), light, radius)
     if style == "basket":
-        skin = sampler.sample_color("c8642b", "b5532a", "7a3b22", p_random=0.2)
-        return paint_over(
-            paint_shaded_clouds(skin, factor=0.85, scale=0.7, offset=offset),
-            _near_to(basketball_seams, reach=0.03),
-            paint_solid_color("1b1715"),
-        )
+        return _sample_basketball(sampler, offset)
     if style == "tennis":
-        felt = sampler.sample_color("c9d63c", "d5dc4a", "e08a2e", p_random=0.25)
-        return paint_over(
-            paint_shaded_clouds(felt, factor=0.85, scale=0.6, offset=offset),
-            _near_to(tennis_seam, reach=0.045),
-            paint_solid_color("eeeee6"),
-        )
+        return _sample_tennis_ball(sampler, offset)
     if style == "star":
-        return paint_over(
-            paint_solid_color(dark), _star(radius), paint_solid_color(light)
-        )
+        star = _star(radius)
+        return paint_over(paint_solid_color(dark), star, paint_solid_color(light))
     if style == "plain":
         return paint_shaded_clouds(dark, factor=1.2, scale=3.0, offset=offset)
     if style == "random":
         return sample_paint(sampler, 2 * radius)
     return _football(light, dark, offset)
+
+
+def _sample_basketball(sampler: ParameterSampler, offset: Array) -> Paint:
+    """Sample the paint of a basketball, with an offset (3,) into the noise."""
+    skin = sampler.sample_color("c8642b", "b5532a", "7a3b22", p_random=0.2)
+    return paint_over(
+        paint_shaded_clouds(skin, factor=0.85, scale=0.7, offset=offset),
+        _near_to(basketball_seams, reach=0.03),
+        paint_solid_color("1b1715"),
+    )
+
+
+def _sample_tennis_ball(sampler: ParameterSampler, offset: Array) -> Paint:
+    """Sample the paint of a tennis ball, with an offset (3,) into the noise."""
+    felt = sampler.sample_color("c9d63c", "d5dc4a", "e08a2e", p_random=0.25)
+    return paint_over(
+        paint_shaded_clouds(felt, factor=0.85, scale=0.6, offset=offset),
+        _near_to(tennis_seam, reach=0.045),
+        paint_solid_color("eeeee6"),
+    )
 
 
 def _beach_colors(sampler: ParameterSampler, light: Array) -> list[Array]:
@@ -293,18 +310,20 @@ def banana(sampler: ParameterSampler) -> Instance:
     patches = shapes.sweep_section(
         "banana", path, section, radius, start_axis=(0.0, 0.0, 1.0), has_caps=True
     )
-    patches = shapes.transform_patches(
-        patches, shapes.make_rotation_matrix("y", sampler(9.0, low=0.0, high=14.0))
-    )
-    patches = shapes.transform_patches(
-        patches, shapes.make_rotation_matrix("z", sampler(78.0, low=45.0, high=120.0))
-    )
+    rotated = _lay_banana(sampler, patches)
     paint = _banana_paint(sampler, path, stem_length)
     return Instance(
-        patches,
+        rotated,
         {"banana": choose_paint_or_random(sampler, length, paint, p_random=0.4)},
         sample_material(sampler, roughness=0.45, clearcoat=0.1),
     )
+
+
+def _lay_banana(sampler: ParameterSampler, patches: list[Patch]) -> list[Patch]:
+    """Tilt a banana about the y axis, and turn it about z, at random."""
+    tilt = shapes.make_rotation_matrix("y", sampler(9.0, low=0.0, high=14.0))
+    turn = shapes.make_rotation_matrix("z", sampler(78.0, low=45.0, high=120.0))
+    return shapes.transform_patches(shapes.transform_patches(patches, tilt), turn)
 
 
 def _banana_path(bend: float, length: float) -> Array:
@@ -373,37 +392,78 @@ def _banana_paint(sampler: ParameterSampler, path: Array, stem_length: float) ->
     """
     offset = sampler.sample_noise_offset()
     skin = sampler.sample_color("f0c930", "f3d64a", "e3b62a", "b7c04a", p_random=0.0)
-    dark = parse_hex_color("3a2a18")
-    brown = parse_hex_color("6b4520")
-    green = parse_hex_color("a9b13c")
     fleck_amount = sampler(0.1, low=0.0, high=0.22)
+    return _banana_skin(skin, path, stem_length, offset, fleck_amount)
 
-    def paint(t: Texels) -> Array:
-        """Paint the skin, then green, flecks, the brown stem and both dark ends."""
-        stem_distance = np.linalg.norm(t.xyz - path[0], axis=1)
-        tip_distance = np.linalg.norm(t.xyz - path[-1], axis=1)
-        clouds = compute_value_noise(t.xyz / 2.2 + offset)
-        color = blend_colors(skin, scale_brightness(skin, 0.86), clouds)
 
-        # Green fades over 2.6 cm from the stem, and over 2.2 cm from the tip.
-        stem_green = np.clip(1.0 - (stem_distance - 0.9 * stem_length) / 2.6, 0.0, 1.0)
-        tip_green = np.clip(1.0 - tip_distance / 2.2, 0.0, 1.0)
-        color = blend_colors(color, green, stem_green * 0.75)
-        color = blend_colors(color, green, tip_green * 0.5)
+@painter
+def _banana_skin(
+    t: Texels,
+    skin: Array,
+    path: Array,
+    stem_length: float,
+    offset: Array,
+    fleck_amount: float,
+) -> Array:
+    """Paint the skin, then green, flecks, the brown stem and both dark ends.
 
-        flecks = _flecks(t.xyz, offset, fleck_amount)
-        color = blend_colors(color, brown, flecks * 0.85)
+    Args:
+        t: points of the banana.
+        skin: color where it is ripe.
+        path: (N, 3) of the banana, whose ends are those of the stem and of the tip.
+        stem_length: length of the stem.
+        offset: (3,) into the noise.
+        fleck_amount: as for `_flecks`.
+    """
+    stem_distance = np.linalg.norm(t.xyz - path[0], axis=1)
+    tip_distance = np.linalg.norm(t.xyz - path[-1], axis=1)
+    clouds = compute_value_noise(t.xyz / 2.2 + offset)
+    color = blend_colors(skin, scale_brightness(skin, 0.86), clouds)
 
-        # Distances are negated, since `compute_soft_step` is 1 above its threshold: each
-        # mask covers what is nearer than that.
-        stem_brown = compute_soft_step(-stem_distance, -0.5 * stem_length, soft=1.3)
-        stem_end = compute_soft_step(-stem_distance, -0.45, soft=0.5)
-        tip_end = compute_soft_step(-tip_distance, -0.75, soft=0.5)
-        color = blend_colors(color, brown, stem_brown * 0.5)
-        color = blend_colors(color, dark, stem_end)
-        return blend_colors(color, dark, tip_end)
+    color = _paint_ends_green(color, stem_distance, tip_distance, stem_length)
+    flecks = _flecks(t.xyz, offset, fleck_amount)
+    color = blend_colors(color, parse_hex_color(BANANA_BROWN), flecks * 0.85)
+    return _darken_ends(color, stem_distance, tip_distance, stem_length)
 
-    return paint
+
+def _paint_ends_green(
+    color: Array, stem_distance: Array, tip_distance: Array, stem_length: float
+) -> Array:
+    """Paint both ends of a banana green, which fades towards its middle.
+
+    Green fades over 2.6 cm from the stem, and over 2.2 cm from the tip.
+
+    Args:
+        color: colors (N, 3) of points.
+        stem_distance, tip_distance: distances (N,) from the ends of stem and tip.
+        stem_length: length of the stem.
+    """
+    green = parse_hex_color("a9b13c")
+    stem_green = np.clip(1.0 - (stem_distance - 0.9 * stem_length) / 2.6, 0.0, 1.0)
+    tip_green = np.clip(1.0 - tip_distance / 2.2, 0.0, 1.0)
+    color = blend_colors(color, green, stem_green * 0.75)
+    return blend_colors(color, green, tip_green * 0.5)
+
+
+def _darken_ends(
+    color: Array, stem_distance: Array, tip_distance: Array, stem_length: float
+) -> Array:
+    """Blend the colors (N, 3) of a banana with brown at the stem, and dark at both ends.
+
+    Args:
+        color: colors of points.
+        stem_distance, tip_distance: distances (N,) from both ends.
+        stem_length: length of the stem.
+    """
+    dark = parse_hex_color("3a2a18")
+    # Distances are negated, since `compute_soft_step` is 1 above its threshold: each
+    # mask covers what is nearer than that.
+    stem_brown = compute_soft_step(-stem_distance, -0.5 * stem_length, soft=1.3)
+    stem_end = compute_soft_step(-stem_distance, -0.45, soft=0.5)
+    tip_end = compute_soft_step(-tip_distance, -0.75, soft=0.5)
+    color = blend_colors(color, parse_hex_color(BANANA_BROWN), stem_brown * 0.5)
+    color = blend_colors(color, dark, stem_end)
+    return blend_colors(color, dark, tip_end)
 
 
 def _flecks(points: Array, offset: Array, amount: float) -> Array:
@@ -444,40 +504,53 @@ def book(sampler: ParameterSampler) -> Instance:
     random one.
     """
     width = sampler(15.5, low=12.0, high=18.0)
-    height = 22.5
-    size = _BookSize(width, height, thickness=sampler(4.2, low=2.2, high=6.0))
+    size = _BookSize(width, 22.5, thickness=sampler(4.2, low=2.2, high=6.0))
     board = sampler(0.34, low=0.2, high=0.45)  # thickness of a cover
     overhang = sampler(0.4, low=0.2, high=0.6)  # how far covers extend over the pages
     bulge = sampler(0.35, low=0.0, high=0.7)
-    patches: list[Patch] = []
-    for z in (board / 2, size.thickness - board / 2):
-        patches += shapes.make_rounded_box(
-            "cover", (COVER_SHIFT, 0.0, z), (width, height, board), bevel=0.12
-        )
-    # Along x the pages reach from 0.55 - width / 2, near the inner side of the spine, to
-    # width / 2 + 0.05 - overhang, which is 0.2 + `overhang` before the edge of the
-    # covers.
-    pages_center = (0.3 - overhang / 2, 0.0, size.thickness / 2)
-    pages_size = (
-        width - overhang - 0.5,
-        height - 2 * overhang,
-        size.thickness - 2 * board + 0.04,  # 0.02 inside of each cover, without a gap
-    )
-    patches += shapes.make_rounded_box(
-        "pages", pages_center, pages_size, bevel=0.05, steps=1
-    )
-    patches += _round_spine(size, bulge, board)
+    patches = [
+        *_book_covers(size, board),
+        *_book_pages(size, board, overhang),
+        *_round_spine(size, bulge, board),
+    ]
     # -122 degrees: seen from the usual camera, the spine is at the side and the front
     # cover is readable.
-    rotated = shapes.transform_patches(
-        patches,
-        shapes.make_rotation_matrix("z", sampler(-122.0, low=-150.0, high=-100.0)),
-    )
+    turn = shapes.make_rotation_matrix("z", sampler(-122.0, low=-150.0, high=-100.0))
     return Instance(
-        rotated,
+        shapes.transform_patches(patches, turn),
         _book_paints(sampler, size),
         sample_material(sampler, roughness=0.55, clearcoat=0.0),
     )
+
+
+def _book_covers(size: _BookSize, board: float) -> list[Patch]:
+    """Create the back cover and the front cover of a book, `board` thick."""
+    patches: list[Patch] = []
+    for z in (board / 2, size.thickness - board / 2):
+        patches += shapes.make_rounded_box(
+            "cover", (COVER_SHIFT, 0.0, z), (size.width, size.height, board), bevel=0.12
+        )
+    return patches
+
+
+def _book_pages(size: _BookSize, board: float, overhang: float) -> list[Patch]:
+    """Create the block of a book's pages.
+
+    Args:
+        size: the size of the book.
+        board: thickness of a cover.
+        overhang: how far covers extend over the pages.
+    """
+    # Along x the pages reach from 0.55 - width / 2, near the inner side of the spine, to
+    # width / 2 + 0.05 - overhang, which is 0.2 + `overhang` before the edge of the
+    # covers.
+    center = (0.3 - overhang / 2, 0.0, size.thickness / 2)
+    pages_size = (
+        size.width - overhang - 0.5,
+        size.height - 2 * overhang,
+        size.thickness - 2 * board + 0.04,  # 0.02 inside of each cover, without a gap
+    )
+    return shapes.make_rounded_box("pages", center, pages_size, bevel=0.05, steps=1)
 
 
 def _round_spine(size: _BookSize, bulge: float, board: float) -> list[Patch]:
@@ -512,14 +585,10 @@ def _book_paints(sampler: ParameterSampler, size: _BookSize) -> dict[str, Paint]
         "7a1f2b", "1f3f5f", "2f5b46", "20242a", "c98a3a", "5b3a6b", "d8d0bd"
     )
     gold = sampler.sample_color("d8b45a", "efe6cf", "1d1f22", p_random=0.25)
-    cloth = choose_paint_or_random(
-        sampler,
-        size.height,
-        paint_shaded_clouds(
-            cloth_color, factor=0.85, scale=0.6, offset=offset, contrast=1.2
-        ),
-        p_random=0.3,
+    clouds = paint_shaded_clouds(
+        cloth_color, factor=0.85, scale=0.6, offset=offset, contrast=1.2
     )
+    cloth = choose_paint_or_random(sampler, size.height, clouds, p_random=0.3)
     style = sampler.sample_choice("frame", "blocks", "picture", "plain")
     cover = _cover_paint(sampler, style, cloth, gold, size)
     paper = parse_hex_color("f4f2ea")
@@ -636,29 +705,41 @@ def _cover_paint(
         size: the size of the book.
     """
     accent = sampler.sample_color("c9a24b", "2f6f8f", "b5442e", "3d6b4a")
+    if style == "plain":
+        return cloth
+    return _decorated_cover(style, cloth, gold, accent, size)
 
-    def paint(t: Texels) -> Array:
-        """Paint the cloth, and on the front the decoration and the words."""
-        color = cloth(t)
-        if style == "plain":
-            return color
-        # From the middle of the cover, with y downwards: the spine is at -x, so that
-        # the upper edge of the front cover is at +y of the book.
-        x = t.xyz[:, 0] - COVER_SHIFT
-        y = -t.xyz[:, 1]
-        is_front = (t.xyz[:, 2] > size.thickness - 0.1).astype(np.float64)
-        if style == "picture":
-            picture = _picture_mask(x, y, size) * is_front
-            color = blend_colors(color, accent, picture)
-            color = blend_colors(color, gold, picture * _picture_spot(x, y, size))
-        if style == "frame":
-            color = blend_colors(color, gold, _frame_mask(x, y, size) * is_front)
-        color = blend_colors(color, gold, _word_mask(x, y, size) * is_front)
-        if style != "picture":
-            color = blend_colors(color, gold, _seal_mask(x, y, size) * is_front)
-        return color
 
-    return paint
+@painter
+def _decorated_cover(
+    t: Texels, style: str, cloth: Paint, gold: Array, accent: Array, size: _BookSize
+) -> Array:
+    """Paint the cloth, and on the front the decoration and the words.
+
+    Args:
+        t: points of the covers.
+        style: "picture", "frame" or "blocks", see `_cover_paint`.
+        cloth: paint of both covers.
+        gold: color of the decoration and the words.
+        accent: color of the picture.
+        size: the size of the book.
+    """
+    color = cloth(t)
+    # From the middle of the cover, with y downwards: the spine is at -x, so that
+    # the upper edge of the front cover is at +y of the book.
+    x = t.xyz[:, 0] - COVER_SHIFT
+    y = -t.xyz[:, 1]
+    is_front = (t.xyz[:, 2] > size.thickness - 0.1).astype(np.float64)
+    if style == "picture":
+        picture = _picture_mask(x, y, size) * is_front
+        color = blend_colors(color, accent, picture)
+        color = blend_colors(color, gold, picture * _picture_spot(x, y, size))
+    if style == "frame":
+        color = blend_colors(color, gold, _frame_mask(x, y, size) * is_front)
+    color = blend_colors(color, gold, _word_mask(x, y, size) * is_front)
+    if style != "picture":
+        color = blend_colors(color, gold, _seal_mask(x, y, size) * is_front)
+    return color
 
 
 def _in_rectangle(x: Array, y: Array, half_width: float, half_height: float) -> Array:
@@ -805,14 +886,7 @@ def _face(t: Texels, red: Array, radius: float) -> Array:
     """
     _, y, z = t.xyz.T
     apothem = radius * np.cos(np.pi / 8)  # from the middle of the octagon to its sides
-    # Directions of the eight sides' normals, in the plane of y and z. Corners are at 22.5
-    # degrees and every 45 degrees from there. A normal is half of that, pi / 8, after
-    # each corner.
-    side_angles = np.pi * (np.arange(8) + 0.5) / 4 + np.pi / 8
-    # apothem of the octagon whose outline goes through each texel
-    texel_apothem = np.max(
-        [y * np.cos(angle) + z * np.sin(angle) for angle in side_angles], axis=0
-    )
+    texel_apothem = _octagon_apothem(y, z)
     # The rim is white between 91.5 % and 98.5 % of the apothem.
     rim = compute_soft_step(texel_apothem - 0.915 * apothem, 0.0, soft=0.006)
     rim = rim * compute_soft_step(0.985 * apothem - texel_apothem, 0.0, soft=0.006)
@@ -821,6 +895,20 @@ def _face(t: Texels, red: Array, radius: float) -> Array:
     stroke_distance = shapes.distance_to_polylines(y, z, *strokes)
     word = compute_soft_step(0.05 * apothem - stroke_distance, 0.0, soft=0.006)
     return blend_colors(red, parse_hex_color("f3f2ee"), np.maximum(rim, word))
+
+
+def _octagon_apothem(y: Array, z: Array) -> Array:
+    """Return the apothem (N,) of the octagon whose outline goes through each point.
+
+    Args:
+        y, z: coordinates (N,) from the middle of the octagon.
+    """
+    # Directions of the eight sides' normals, in the plane of y and z. Corners are at 22.5
+    # degrees and every 45 degrees from there. A normal is half of that, pi / 8, after
+    # each corner.
+    side_angles = np.pi * (np.arange(8) + 0.5) / 4 + np.pi / 8
+    projections = [y * np.cos(angle) + z * np.sin(angle) for angle in side_angles]
+    return np.asarray(np.max(projections, axis=0))
 
 
 @make_family(unit_in_metres=1.0, texels=192)
@@ -838,23 +926,34 @@ def stop_sign(sampler: ParameterSampler) -> Instance:
         *_sign_stand(),
         *_sign_clamps(radius, height),
     ]
-    gray = sampler.sample_color("9a9da0", "7d8083", p_random=0.0)
-    paints = {
-        "face": _face(red, radius),
-        "metal": paint_solid_color("a4a7aa"),
-        "post": paint_solid_color(gray),
-        "rubber": paint_solid_color("1d1d1f"),
-    }
-    rotated = shapes.transform_patches(
-        patches, shapes.make_rotation_matrix("z", sampler(0.0, low=-25.0, high=25.0))
-    )
+    paints = _sign_paints(sampler, red, radius)
+    turn = shapes.make_rotation_matrix("z", sampler(0.0, low=-25.0, high=25.0))
     return Instance(
-        rotated,
+        shapes.transform_patches(patches, turn),
         paints,
         FINISHES["face"],
         texel_density={"metal": 0.25, "post": 0.18, "rubber": 0.3},
         materials_by_tag=FINISHES,
     )
+
+
+def _sign_paints(
+    sampler: ParameterSampler, red: Array, radius: float
+) -> dict[str, Paint]:
+    """Sample the paints of a stop sign by the tags of its parts.
+
+    Args:
+        sampler: samples the gray of the post.
+        red: color of the plate.
+        radius: radius of the plate.
+    """
+    gray = sampler.sample_color("9a9da0", "7d8083", p_random=0.0)
+    return {
+        "face": _face(red, radius),
+        "metal": paint_solid_color("a4a7aa"),
+        "post": paint_solid_color(gray),
+        "rubber": paint_solid_color("1d1d1f"),
+    }
 
 
 def _sign_stand() -> list[Patch]:

@@ -48,21 +48,31 @@ def _claw(
     """
     spread = sampler(0.34, low=0.2, high=0.5)
     t = np.linspace(0.0, 1.0, 14)  # from the root to the tip
-    half_thickness = half_head * (0.72 * (1 - t) + 0.1)
-    half_width = half_head * 0.47 * (1.0 - 0.25 * t)
-    scale = np.stack([half_thickness, half_width], axis=1)
-    section = shapes.rectangle(2.0, 2.0, bevel=0.5, steps=2)
     patches = []
     for side in (-1.0, 1.0):
         # The powers bend the prongs: the tips turn downwards.
         x = 0.25 * half_head - drop * t**1.8
         y = start + length * (t - 0.1 * t**2)
         z = side * half_head * (0.5 + spread * t)
-        curve = np.stack([x, y, z], axis=1)
-        patches += shapes.sweep_section(
-            "head", curve, section, scale, start_axis=(1.0, 0.0, 0.0), has_caps=True
-        )
+        patches += _prong(np.stack([x, y, z], axis=1), half_head)
     return patches
+
+
+def _prong(curve: Array, half_head: float) -> list[Patch]:
+    """Create a prong of a claw along a curve (N, 3), which tapers to its end.
+
+    Args:
+        curve: from the root to the tip.
+        half_head: half the width of the head.
+    """
+    t = np.linspace(0.0, 1.0, len(curve))
+    half_thickness = half_head * (0.72 * (1 - t) + 0.1)
+    half_width = half_head * 0.47 * (1.0 - 0.25 * t)
+    scale = np.stack([half_thickness, half_width], axis=1)
+    section = shapes.rectangle(2.0, 2.0, bevel=0.5, steps=2)
+    return shapes.sweep_section(
+        "head", curve, section, scale, start_axis=(1.0, 0.0, 0.0), has_caps=True
+    )
 
 
 def _points_on_y(*positions: float) -> Array:
@@ -143,23 +153,30 @@ def hammer(sampler: ParameterSampler) -> Instance:
     head = _hammer_head(sampler, style, half_head, half_eye, front, face_radius)
     half_grip, handle = _hammer_handle(sampler, half_head, length)
 
-    # It lies on the head and on the swelling of the handle, at 0.8 of its length. The
-    # head is thicker: the handle is tilted down by the difference. The factors are those
-    # of `_sledge_block`, nearly, and of `_eye_block`.
+    # half the thickness of the head; the factors are those of `_sledge_block`, nearly,
+    # and of `_eye_block`
     half_face = face_radius * 1.2 if style == "sledge" else face_radius
     drop = max(half_head * 1.05, half_face) - half_grip
-    tilt = -float(np.degrees(np.arctan2(drop, 0.8 * length)))
-    patches = shapes.transform_patches(
-        [*head, *handle], shapes.make_rotation_matrix("y", tilt)
-    )
-    patches = shapes.transform_patches(
-        patches, shapes.make_rotation_matrix("z", sampler(58.0, low=20.0, high=90.0))
-    )
+    lay = shapes.make_rotation_matrix("y", _compute_hammer_tilt(drop, length))
+    turn = shapes.make_rotation_matrix("z", sampler(58.0, low=20.0, high=90.0))
+    lying = shapes.transform_patches([*head, *handle], lay)
     return Instance(
-        patches,
+        shapes.transform_patches(lying, turn),
         _hammer_paints(sampler, front, length),
         sample_material(sampler, roughness=0.38, clearcoat=0.2),
     )
+
+
+def _compute_hammer_tilt(drop: float, length: float) -> float:
+    """Return the angle in degrees by which the handle of a lying hammer is tilted down.
+
+    The hammer lies on the head and on the swelling of the handle, at 0.8 of its length.
+
+    Args:
+        drop: by how much the head is thicker there, on one side.
+        length: length of the handle.
+    """
+    return -float(np.degrees(np.arctan2(drop, 0.8 * length)))
 
 
 def _hammer_head(
@@ -187,18 +204,27 @@ def _hammer_head(
         return _sledge_block(sampler, front, face_radius)
     block = _eye_block(half_head, half_eye)
     face = _striking_face(half_head, half_eye, front, face_radius)
-    if style == "claw":
-        back = _claw(
-            sampler,
-            half_head,
-            start=half_eye * 0.95,
-            length=sampler(6.4, low=5.0, high=7.5),
-            drop=sampler(2.6, low=1.2, high=3.6),
-        )
-    else:
-        peen_length = sampler(4.0, low=3.0, high=5.0)
-        back = _peen(sampler, half_head, half_eye, peen_length)
+    back = _sample_hammer_back(sampler, style, half_head, half_eye)
     return block + face + back
+
+
+def _sample_hammer_back(
+    sampler: ParameterSampler, style: str, half_head: float, half_eye: float
+) -> list[Patch]:
+    """Create what is behind the eye of a hammer: a claw or a peen of random length.
+
+    Args:
+        sampler: samples its shape.
+        style: "claw" or "peen".
+        half_head: half the width of the block around the eye.
+        half_eye: half the length of that block, about.
+    """
+    if style == "claw":
+        length = sampler(6.4, low=5.0, high=7.5)
+        drop = sampler(2.6, low=1.2, high=3.6)
+        return _claw(sampler, half_head, half_eye * 0.95, length, drop)
+    length = sampler(4.0, low=3.0, high=5.0)
+    return _peen(sampler, half_head, half_eye, length)
 
 
 def _sledge_block(
@@ -289,14 +315,45 @@ def _hammer_handle(
     """
     t = np.linspace(0.0, 1.0, 30)  # from the head to the end
     swelling = sampler(0.16, low=0.0, high=0.3)
+    half_thickness = half_head * sampler(0.72, low=0.6, high=0.9)
+    half_width = half_head * sampler(0.92, low=0.75, high=1.1)
+    scale = _handle_scale(t, swelling, half_width, half_thickness)
+    top_x = half_head * 1.18  # the end that sticks out of the head
+    # from there to -`length`
+    path = np.stack([top_x - (length + top_x) * t, 0 * t, 0 * t], axis=1)
+    section = _sample_grip_section(sampler)  # is multiplied by `scale`
+    handle = shapes.sweep_section(
+        "handle", path, section, scale, start_axis=(0.0, 1.0, 0.0)
+    )
+    return half_thickness * (1.0 + swelling), handle
+
+
+def _sample_grip_section(sampler: ParameterSampler) -> Array:
+    """Sample the section (M, 2) of a handle: an ellipse, or a rounded square.
+
+    It reaches from -1 to 1 on both axes.
+    """
+    if sampler.sample_bool(0.6, canonical=True):
+        return shapes.ellipse(1.0, 1.0, count=24)
+    return shapes.rectangle(2.0, 2.0, bevel=0.7)
+
+
+def _handle_scale(
+    t: Array, swelling: float, half_width: float, half_thickness: float
+) -> Array:
+    """Return half the extents (N, 2) of a hammer's handle along both axes of its section.
+
+    Args:
+        t: (N,) from 0 at the head to 1 at the end.
+        swelling: by how much it swells where it is held, as a fraction.
+        half_width, half_thickness: half its usual extents along y, the first axis of
+            the section, and along the second axis.
+    """
     # thicker around 0.78 of the length, thinner around 0.45
     grip = swelling * np.exp(-(((t - 0.78) / 0.14) ** 2))
     waist = 0.5 * swelling * np.exp(-(((t - 0.45) / 0.2) ** 2))
-    half_thickness = half_head * sampler(0.72, low=0.6, high=0.9)
-    half_width = half_head * sampler(0.92, low=0.75, high=1.1)
     relative_scale = 1.0 + grip - waist
     rounding = _handle_rounding(t)
-    # half the extent along y, the first axis of the section, and along the second axis
     scale = np.stack(
         [
             half_width * relative_scale * rounding,
@@ -305,18 +362,7 @@ def _hammer_handle(
         axis=1,
     )
     scale[0] *= 0.9  # a bevel at the head
-    top_x = half_head * 1.18  # the end that sticks out of the head
-    # from there to -`length`
-    path = np.stack([top_x - (length + top_x) * t, 0 * t, 0 * t], axis=1)
-    # Sections reach from -1 to 1, and are multiplied by `scale`.
-    if sampler.sample_bool(0.6, canonical=True):
-        section = shapes.ellipse(1.0, 1.0, count=24)
-    else:
-        section = shapes.rectangle(2.0, 2.0, bevel=0.7)
-    handle = shapes.sweep_section(
-        "handle", path, section, scale, start_axis=(0.0, 1.0, 0.0)
-    )
-    return half_thickness * (1.0 + swelling), handle
+    return scale
 
 
 def _handle_rounding(t: Array) -> Array:
@@ -368,26 +414,33 @@ def _hammer_handle_paint(
         length: length of the handle, along -x.
         offset: (3,) into the noise.
     """
-    timber = wood(
-        sampler.sample_color("c48f55", "a8743f", "d9b27c", "7a4f2a", p_random=0.05),
-        scale=0.9,
-        offset=offset,
-        axis=0,
+    timber_color = sampler.sample_color(
+        "c48f55", "a8743f", "d9b27c", "7a4f2a", p_random=0.05
     )
+    timber = wood(timber_color, scale=0.9, offset=offset, axis=0)
     accent = sampler.sample_color("8f2e22", "1f4e79", "d9a02b", "2d2d33", "3d6b4a")
     kind = sampler.sample_choice("wood", "dipped", "rubber")
-    beyond_end = -2 * length  # a mask from there reaches the end of the handle
     if kind == "dipped":
         dip_start = -sampler(0.5, low=0.4, high=0.7) * length
-        dipped = make_range_mask(beyond_end, dip_start, axis=0, soft=0.05)
+        # the mask reaches the end of the handle and farther
+        dipped = make_range_mask(-2 * length, dip_start, axis=0, soft=0.05)
         return paint_over(timber, dipped, paint_solid_color(accent))
     if kind == "rubber":
-        grip = make_range_mask(beyond_end, -0.45 * length, axis=0, soft=0.05)
-        ribs = rings(
-            accent, scale_brightness(accent, 0.7), period=1.1, fraction=0.2, axis=0
-        )
-        return paint_over(paint_solid_color(scale_brightness(accent, 0.5)), grip, ribs)
+        return _paint_rubber_grip(accent, length)
     return timber
+
+
+def _paint_rubber_grip(color: Array, length: float) -> Paint:
+    """Paint a handle dark, with a ribbed grip of a color at its end.
+
+    Args:
+        color: color (3,) of the grip.
+        length: length of the handle, along -x.
+    """
+    # the mask reaches the end of the handle and farther
+    grip = make_range_mask(-2 * length, -0.45 * length, axis=0, soft=0.05)
+    ribs = rings(color, scale_brightness(color, 0.7), period=1.1, fraction=0.2, axis=0)
+    return paint_over(paint_solid_color(scale_brightness(color, 0.5)), grip, ribs)
 
 
 def _make_weight(
@@ -411,6 +464,20 @@ def _make_weight(
         )
     if style == "round":
         return _plate(start, length, radius)
+    return _three_plates(sampler, start, length, radius)
+
+
+def _three_plates(
+    sampler: ParameterSampler, start: float, length: float, radius: float
+) -> list[Patch]:
+    """Create three plates along z, each smaller than the one before, and a nut.
+
+    Args:
+        sampler: chooses the nut.
+        start: z of the inner side of the first plate.
+        length: extent of all plates along z.
+        radius: radius of the first plate.
+    """
     n_plates = 3
     patches = []
     z = start
@@ -494,15 +561,18 @@ def dumbbell(sampler: ParameterSampler) -> Instance:
     other_weight = shapes.transform_patches(
         weight, shapes.make_rotation_matrix("y", 180.0)
     )
-    upright = bar + weight + other_weight
-    lying = shapes.transform_patches(upright, shapes.make_rotation_matrix("y", 90.0))
-    patches = shapes.transform_patches(
-        lying, shapes.make_rotation_matrix("z", sampler(118.0, low=90.0, high=150.0))
-    )
+    patches = _lay_dumbbell(sampler, bar + weight + other_weight)
     paints = _dumbbell_paints(sampler, style, half_grip, length, radius)
     return Instance(
         patches, paints, sample_material(sampler, roughness=0.42, clearcoat=0.2)
     )
+
+
+def _lay_dumbbell(sampler: ParameterSampler, upright: list[Patch]) -> list[Patch]:
+    """Return a dumbbell that lies in a random direction, from one along the z axis."""
+    lying = shapes.transform_patches(upright, shapes.make_rotation_matrix("y", 90.0))
+    turn = shapes.make_rotation_matrix("z", sampler(118.0, low=90.0, high=150.0))
+    return shapes.transform_patches(lying, turn)
 
 
 def _dumbbell_bar(sampler: ParameterSampler, half_grip: float) -> list[Patch]:
@@ -535,17 +605,7 @@ def _dumbbell_paints(
         half_grip: half the length of the bar between the weights.
         length, radius: length and radius of a weight.
     """
-    offset = sampler.sample_noise_offset()
-    iron = sampler.sample_color(
-        "26282b", "3a3d42", "8a8d92", "7a2f8f", "2f6f8f", "c23b4a", p_random=0.25
-    )
-    weight = add_specks(
-        paint_shaded_clouds(iron, factor=1.25, scale=2.5, offset=offset),
-        scale_brightness(iron, 1.9),
-        scale=0.35,
-        offset=offset,
-        amount=sampler(0.08, low=0.0, high=0.2),
-    )
+    weight = _sample_weight_paint(sampler)
     # z of the outer side of a weight. A globe has a radius of 0.95 `radius`, and its
     # center is 0.8 `radius` outside of the grip: see `_make_weight`.
     weight_length = 1.75 * radius if style == "globe" else length
@@ -553,16 +613,41 @@ def _dumbbell_paints(
     accent = sampler.sample_color("c9ccd0", "f2f2f0", "d9a02b", "c23b4a")
     if sampler.sample_bool(0.5, canonical=True):
         weight = paint_over(weight, _end_rings(tip, radius), paint_solid_color(accent))
-    steel = sampler.sample_color("b4b8bd", "8d9298", "2b2d30", p_random=0.2)
-    knurl = paint_over(
-        paint_solid_color(steel),
-        _knurl_mask(half_grip),
-        paint_solid_color(scale_brightness(steel, 0.55)),
-    )
+    knurl = _sample_knurl(sampler, half_grip)
     return {
         "weight": choose_paint_or_random(sampler, 2 * tip, weight, p_random=0.35),
         "bar": knurl,
     }
+
+
+def _sample_weight_paint(sampler: ParameterSampler) -> Paint:
+    """Sample the paint of a dumbbell's weights: cast iron with specks, or a color."""
+    offset = sampler.sample_noise_offset()
+    iron = sampler.sample_color(
+        "26282b", "3a3d42", "8a8d92", "7a2f8f", "2f6f8f", "c23b4a", p_random=0.25
+    )
+    return add_specks(
+        paint_shaded_clouds(iron, factor=1.25, scale=2.5, offset=offset),
+        scale_brightness(iron, 1.9),
+        scale=0.35,
+        offset=offset,
+        amount=sampler(0.08, low=0.0, high=0.2),
+    )
+
+
+def _sample_knurl(sampler: ParameterSampler, half_grip: float) -> Paint:
+    """Sample the steel of a bar that is knurled where it is held.
+
+    Args:
+        sampler: samples the color.
+        half_grip: half the length of the bar between the weights.
+    """
+    steel = sampler.sample_color("b4b8bd", "8d9298", "2b2d30", p_random=0.2)
+    return paint_over(
+        paint_solid_color(steel),
+        _knurl_mask(half_grip),
+        paint_solid_color(scale_brightness(steel, 0.55)),
+    )
 
 
 @painter

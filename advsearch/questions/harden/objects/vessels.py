@@ -74,19 +74,31 @@ def make_handle(
     bottom_radius = shapes.radius_at_height(profile, bottom) - inset
     top_radius = shapes.radius_at_height(profile, top) - inset
     curve = _handle_curve(style, (bottom_radius, bottom), (top_radius, top), reach)
-    half_thickness = sampler(0.42, low=0.32, high=0.6)
-    half_width = sampler(0.62, low=0.4, high=0.95)
-    if sampler.sample_bool(0.7, canonical=True):
-        section = shapes.ellipse(half_thickness, half_width, count=16)
-    else:
-        section = shapes.rectangle(
-            2 * half_thickness, 2 * half_width, bevel=0.6 * half_thickness
-        )
+    section = _sample_handle_section(sampler)
     # up to a quarter thicker at both ends
     root_flare = 1.0 + 0.25 * np.abs(np.linspace(-1.0, 1.0, len(curve))) ** 4
     return shapes.sweep_section(
         "handle", shapes.to_xz_plane(curve), section, root_flare
     )
+
+
+def _sample_handle_section(sampler: ParameterSampler) -> Array:
+    """Sample the section (M, 2) of a handle: an ellipse or a rounded rectangle."""
+    half_thickness = sampler(0.42, low=0.32, high=0.6)
+    half_width = sampler(0.62, low=0.4, high=0.95)
+    if sampler.sample_bool(0.7, canonical=True):
+        return shapes.ellipse(half_thickness, half_width, count=16)
+    return shapes.rectangle(
+        2 * half_thickness, 2 * half_width, bevel=0.6 * half_thickness
+    )
+
+
+REACHES = {
+    "round": (0.82, 0.98, 0.82),
+    "ear": (0.98, 0.9, 0.5),
+    "loop": (0.85, 1.0, 0.85),
+}
+"""How far a handle extends near the top, the middle and the bottom, as fractions."""
 
 
 def _handle_curve(
@@ -97,31 +109,17 @@ def _handle_curve(
 ) -> Array:
     """Return the curve (K, 2) of a handle from its upper to its lower root.
 
-    A square handle has two rounded bends; the others go through knots at three heights.
-
     Args:
         style: "round", "ear" (widest at the top), "square" or "loop" (small).
         bottom_root, top_root: (r, z) where the handle meets the wall.
         reach: its extent from the wall.
     """
+    if style == "square":
+        return _square_handle_curve(bottom_root, top_root, reach)
     bottom = bottom_root[1]
     top = top_root[1]
     wall_radius = max(bottom_root[0], top_root[0])
-    if style == "square":
-        outer = wall_radius + reach
-        corners = [top_root, (outer, top), (outer, bottom), bottom_root]
-        rounded = shapes.round_corners(corners, radius=0.45 * reach, steps=6)
-        # The spline distributes its points evenly; the dense polyline keeps its
-        # corners.
-        return shapes.sample_spline(
-            shapes.subdivide(rounded, longest=0.8), count=HANDLE_POINTS
-        )
-    # how far it extends near the top, the middle and the bottom, in units of `reach`
-    upper_reach, middle_reach, lower_reach = {
-        "round": (0.82, 0.98, 0.82),
-        "ear": (0.98, 0.9, 0.5),
-        "loop": (0.85, 1.0, 0.85),
-    }[style]
+    upper_reach, middle_reach, lower_reach = REACHES[style]
     height = top - bottom
     knots = [
         top_root,
@@ -133,6 +131,23 @@ def _handle_curve(
         bottom_root,
     ]
     return shapes.sample_spline(knots, count=HANDLE_POINTS)
+
+
+def _square_handle_curve(
+    bottom_root: tuple[float, float], top_root: tuple[float, float], reach: float
+) -> Array:
+    """Return the curve (K, 2) of a handle with two rounded bends, downwards.
+
+    Args:
+        bottom_root, top_root: (r, z) where the handle meets the wall.
+        reach: its extent from the wall.
+    """
+    outer = max(bottom_root[0], top_root[0]) + reach
+    corners = [top_root, (outer, top_root[1]), (outer, bottom_root[1]), bottom_root]
+    rounded = shapes.round_corners(corners, radius=0.45 * reach, steps=6)
+    # The spline distributes its points evenly; the dense polyline keeps its corners.
+    dense = shapes.subdivide(rounded, longest=0.8)
+    return shapes.sample_spline(dense, count=HANDLE_POINTS)
 
 
 def _ceramic(
@@ -155,28 +170,35 @@ def _ceramic(
     if kind in ("band", "bands", "checks", "zigzag", "dip"):
         return _ceramic_belt(sampler, kind, height, glaze, accent, second_color)
     if kind == "dots":
-        return dots(
-            glaze,
-            second_color,
-            cell=sampler(2.0, low=1.2, high=3.2),
-            radius=sampler(0.3, low=0.2, high=0.4),
-        )
+        cell = sampler(2.0, low=1.2, high=3.2)
+        radius = sampler(0.3, low=0.2, high=0.4)
+        return dots(glaze, second_color, cell=cell, radius=radius)
     if kind == "stripes":
-        return stripes(
-            sampler.sample_color(PALE, "f4f4f2"),
-            second_color,
-            cell=sampler(1.8, low=1.0, high=4.0),
-            fraction=sampler(0.5, low=0.25, high=0.6),
-            slant=int(sampler.sample_choice(0, 2)),
-        )
+        return _ceramic_stripes(sampler, second_color)
     if kind == "rings":
-        return rings(
-            sampler.sample_color(PALE),
-            second_color,
-            period=height * sampler(0.12, low=0.06, high=0.25),
-            fraction=sampler(0.5, low=0.2, high=0.7),
-        )
+        return _ceramic_rings(sampler, height, second_color)
     return glaze
+
+
+def _ceramic_stripes(sampler: ParameterSampler, color: Array) -> Paint:
+    """Sample stripes of a color on a pale ground."""
+    return stripes(
+        sampler.sample_color(PALE, "f4f4f2"),
+        color,
+        cell=sampler(1.8, low=1.0, high=4.0),
+        fraction=sampler(0.5, low=0.25, high=0.6),
+        slant=int(sampler.sample_choice(0, 2)),
+    )
+
+
+def _ceramic_rings(sampler: ParameterSampler, height: float, color: Array) -> Paint:
+    """Sample rings of a color on a pale ground, for a vessel of a height."""
+    return rings(
+        sampler.sample_color(PALE),
+        color,
+        period=height * sampler(0.12, low=0.06, high=0.25),
+        fraction=sampler(0.5, low=0.2, high=0.7),
+    )
 
 
 def _ceramic_belt(
@@ -205,17 +227,29 @@ def _ceramic_belt(
         low = sampler(0.5, low=0.3, high=0.7) * height
         # twice the height: up to the top, with some margin for the lip
         return paint_over(glaze, make_range_mask(low, 2 * height, soft=0.1), accent)
+    return _sample_patterned_belt(sampler, kind, height, glaze, second_color)
+
+
+def _sample_patterned_belt(
+    sampler: ParameterSampler, kind: str, height: float, glaze: Paint, color: Array
+) -> Paint:
+    """Sample a belt with a pattern of two colors.
+
+    Args:
+        sampler: samples the proportions and the pale color.
+        kind: "bands", "checks" or "zigzag".
+        height: height of the vessel.
+        glaze: paint of the rest of the vessel.
+        color: the other color of the pattern.
+    """
     if kind == "bands":
-        bands = rings(parse_hex_color(PALE), second_color, period=0.13 * height)
+        bands = rings(parse_hex_color(PALE), color, period=0.13 * height)
         return paint_over(glaze, make_range_mask(0.62 * height, 0.9 * height), bands)
+    pale = sampler.sample_color(PALE)
     if kind == "checks":
-        board = checks(
-            sampler.sample_color(PALE),
-            second_color,
-            cell=sampler(1.4, low=0.9, high=2.2),
-        )
+        board = checks(pale, color, cell=sampler(1.4, low=0.9, high=2.2))
         return paint_over(glaze, make_range_mask(0.25 * height, 0.75 * height), board)
-    chevrons = zigzag(sampler.sample_color(PALE), second_color, cell=2.5)
+    chevrons = zigzag(pale, color, cell=2.5)
     return paint_over(glaze, make_range_mask(0.3 * height, 0.7 * height), chevrons)
 
 
@@ -228,7 +262,31 @@ def mug(sampler: ParameterSampler) -> Instance:
     """
     height = sampler(9.4, low=7.6, high=12.0)
     wall, side, body = _mug_body(sampler, height)
+    handle = _mug_handle(sampler, height, wall, side)
+    paints = _mug_paints(sampler, height)
+    # -108 degrees: in the usual view the handle is at the side, where it is visible.
+    turn = shapes.make_rotation_matrix("z", -108.0)
+    patches = [*body, *shapes.transform_patches(handle, turn)]
+    return Instance(
+        shapes.transform_patches(patches, SEAM_ROTATION),
+        paints,
+        sample_material(sampler, roughness=0.3, clearcoat=0.5),
+        # These parts are hardly visible, so they get fewer texels.
+        texel_density={"inside": 0.8, "base": 0.6},
+    )
 
+
+def _mug_handle(
+    sampler: ParameterSampler, height: float, wall: float, side: Array
+) -> list[Patch]:
+    """Create the handle of a mug on its +x side.
+
+    Args:
+        sampler: samples its style and its size.
+        height: height of the mug.
+        wall: thickness of its wall.
+        side: profile (K, 2) of its side.
+    """
     style = sampler.sample_choice("ear", "round", "square", "loop")
     handle_top = height * sampler(0.85, low=0.76, high=0.88)
     if style == "loop":
@@ -236,7 +294,7 @@ def mug(sampler: ParameterSampler) -> Instance:
         handle_bottom = height * sampler(0.3, low=0.34, high=0.42)
     else:
         handle_bottom = height * sampler(0.2, low=0.16, high=0.3)
-    handle = make_handle(
+    return make_handle(
         sampler,
         style,
         bottom=handle_bottom,
@@ -244,24 +302,6 @@ def mug(sampler: ParameterSampler) -> Instance:
         reach=sampler(2.9, low=2.3, high=3.4),
         profile=side,
         inset=0.55 * wall,
-    )
-
-    paints = _mug_paints(sampler, height)
-    patches = shapes.transform_patches(
-        # -108 degrees: in the usual view the handle is at the side, where it is
-        # visible.
-        [
-            *body,
-            *shapes.transform_patches(handle, shapes.make_rotation_matrix("z", -108.0)),
-        ],
-        SEAM_ROTATION,
-    )
-    return Instance(
-        patches,
-        paints,
-        sample_material(sampler, roughness=0.3, clearcoat=0.5),
-        # These parts are hardly visible, so they get fewer texels.
-        texel_density={"inside": 0.8, "base": 0.6},
     )
 
 
@@ -301,17 +341,7 @@ def _mug_paints(sampler: ParameterSampler, height: float) -> dict[str, Paint]:
         height: height of the mug.
     """
     offset = sampler.sample_noise_offset()
-    clay = sampler.sample_color(
-        "e9dfca", "f3f1ec", "d9c7a5", "3a3f45", "8fa7a0", "b5442e", "6f8fb0"
-    )
-    specks = sampler.sample_color("7d6247", p_random=0.2)
-    glaze = add_specks(
-        paint_shaded_clouds(clay, factor=0.93, scale=3.0, offset=offset),
-        specks,
-        scale=0.28,
-        offset=offset,
-        amount=sampler(0.06, low=0.0, high=0.14),
-    )
+    glaze = _sample_speckled_glaze(sampler, offset)
     deep_color = sampler.sample_color("1f4e79", "2c6e63", "a63c2a", "d79b2b", "2d2d33")
     accent = paint_shaded_clouds(deep_color, factor=1.35, scale=2.2, offset=offset)
     decoration = _ceramic(sampler, height, glaze, accent)
@@ -327,6 +357,21 @@ def _mug_paints(sampler: ParameterSampler, height: float) -> dict[str, Paint]:
         "base": raw_clay,
         "handle": sampler.sample_choice(glaze, decorated, accent),
     }
+
+
+def _sample_speckled_glaze(sampler: ParameterSampler, offset: Array) -> Paint:
+    """Sample a glaze with specks, with an offset (3,) into the noise."""
+    clay = sampler.sample_color(
+        "e9dfca", "f3f1ec", "d9c7a5", "3a3f45", "8fa7a0", "b5442e", "6f8fb0"
+    )
+    specks = sampler.sample_color("7d6247", p_random=0.2)
+    return add_specks(
+        paint_shaded_clouds(clay, factor=0.93, scale=3.0, offset=offset),
+        specks,
+        scale=0.28,
+        offset=offset,
+        amount=sampler(0.06, low=0.0, high=0.14),
+    )
 
 
 def _mug_inside(sampler: ParameterSampler, decorated: Paint, glaze: Paint) -> Paint:
@@ -376,21 +421,30 @@ def _bowl_paints(
     raw_clay = paint_solid_color("9b7352")
     is_canonical = sampler.rng is None
     if is_canonical:
-        with_rim = paint_over(
-            glaze, make_range_mask(0.93 * height, 2 * height, soft=0.25), accent
-        )
-        outside = paint_over(with_rim, make_range_mask(-1.0, 0.55, soft=0.1), raw_clay)
+        outside = _paint_canonical_bowl(height, glaze, accent, raw_clay)
     else:
         decoration = _ceramic(sampler, height, glaze, accent)
         outside = choose_paint_or_random(sampler, 2 * radius, decoration)
-    inside = sampler.sample_choice(
-        accent,
-        glaze,
-        outside,
-        paint_solid_color(sampler.sample_color("f3f1ec")),
-        rings(clay, scale_brightness(clay, 1.3), period=height * 0.2),
-    )
+    pale = paint_solid_color(sampler.sample_color("f3f1ec"))
+    clay_rings = rings(clay, scale_brightness(clay, 1.3), period=height * 0.2)
+    inside = sampler.sample_choice(accent, glaze, outside, pale, clay_rings)
     return {"outside": outside, "inside": inside, "base": raw_clay}
+
+
+def _paint_canonical_bowl(
+    height: float, glaze: Paint, rim_paint: Paint, raw_clay: Paint
+) -> Paint:
+    """Return the paint of a glazed bowl with a pale rim and a raw foot.
+
+    Args:
+        height: height of the rim.
+        glaze: paint of the most part.
+        rim_paint: paint of the rim.
+        raw_clay: paint of the foot.
+    """
+    is_rim = make_range_mask(0.93 * height, 2 * height, soft=0.25)
+    with_rim = paint_over(glaze, is_rim, rim_paint)
+    return paint_over(with_rim, make_range_mask(-1.0, 0.55, soft=0.1), raw_clay)
 
 
 def _bowl_body(sampler: ParameterSampler, radius: float, height: float) -> list[Patch]:
@@ -451,6 +505,34 @@ def _bottle_body(sampler: ParameterSampler, height: float) -> tuple[float, list[
     radius = sampler(3.75, low=3.0, high=4.8)
     neck_radius = sampler(1.35, low=1.0, high=1.7)
     shoulder = height * sampler(0.62, low=0.45, high=0.68)
+    body = _sample_bottle_side(sampler, height, radius, neck_radius, shoulder)
+    ring_radius = neck_radius * 0.95 + sampler(0.28, low=0.1, high=0.4)
+    has_cap = sampler.sample_bool(0.4)
+    mouth = _mouth_ring(ring_radius, neck_radius, height)
+    outside = np.concatenate([shapes.subdivide(body, longest=1.6), mouth])
+    patches = shapes.make_vessel(
+        outside, wall=sampler(0.35, low=0.3, high=0.45), floor=0.8, step=1.6, columns=48
+    )
+    if has_cap:
+        patches += _cap(sampler, ring_radius + 0.12, height)
+    return shoulder, patches
+
+
+def _sample_bottle_side(
+    sampler: ParameterSampler,
+    height: float,
+    radius: float,
+    neck_radius: float,
+    shoulder: float,
+) -> Array:
+    """Sample the profile (K, 2), (r, z), of a bottle from its foot to its mouth.
+
+    Args:
+        sampler: samples the shoulder and the taper.
+        height: height of the neck's end.
+        radius, neck_radius: radii of the body and of the neck.
+        shoulder: height at which the body begins to narrow.
+    """
     rise = height * sampler(0.15, low=0.08, high=0.22)  # from the shoulder to the neck
     slope = sampler(0.35, low=0.1, high=0.8)  # 0: square shoulder, 1: sloping
     taper = sampler(1.0, low=0.93, high=1.03)
@@ -466,19 +548,8 @@ def _bottle_body(sampler: ParameterSampler, height: float) -> tuple[float, list[
         (neck_radius * 1.03, shoulder + rise),
         (neck_radius * 0.95, height - 1.6),
     ]
-    body = shapes.round_corners(
-        corners, radius=[0.8, 0.45 * rise + 0.4, 0.6 * rise, 0.5 * rise], steps=7
-    )
-    ring_radius = neck_radius * 0.95 + sampler(0.28, low=0.1, high=0.4)
-    has_cap = sampler.sample_bool(0.4)
-    mouth = _mouth_ring(ring_radius, neck_radius, height)
-    outside = np.concatenate([shapes.subdivide(body, longest=1.6), mouth])
-    patches = shapes.make_vessel(
-        outside, wall=sampler(0.35, low=0.3, high=0.45), floor=0.8, step=1.6, columns=48
-    )
-    if has_cap:
-        patches += _cap(sampler, ring_radius + 0.12, height)
-    return shoulder, patches
+    roundings = [0.8, 0.45 * rise + 0.4, 0.6 * rise, 0.5 * rise]
+    return shapes.round_corners(corners, radius=roundings, steps=7)
 
 
 def _mouth_ring(
@@ -513,38 +584,59 @@ def _bottle_paints(
     glass = sampler.sample_color(
         "17351f", "4a2c14", "1d3f2a", "cfdde0", "2a4d69", "ece7dd", "111416"
     )
-    outside = choose_paint_or_random(
-        sampler,
-        height,
-        paint_shaded_clouds(glass, factor=1.25, scale=9.0, offset=offset),
-        p_random=0.25,
-    )
-    paper = sampler.sample_color("efe6cf", "f5f2ea", "20242a", "c9a24b", p_random=0.3)
-    ink = sampler.sample_color("7a1f2b", "23395d", "2e2a25", "b08d3c", p_random=0.3)
-    label_bottom = 0.14 * height
-    label_top = min(sampler(0.44, low=0.3, high=0.5) * height, shoulder - 1.5)
-    has_label = not sampler.sample_bool(0.2)
-    if has_label:
-        outside = _add_label(sampler, outside, paper, ink, label_bottom, label_top)
-    foil = sampler.sample_color("6d1a26", "b08d3c", "1c1f24", "23395d", "d5d5d5")
-    if sampler.sample_bool(0.5, canonical=True):
-        foil_paint = add_specks(
-            paint_solid_color(foil),
-            scale_brightness(foil, 1.3),
-            scale=0.5,
-            offset=offset,
-        )
-        outside = paint_over(
-            outside, make_range_mask(height * 0.8, 2 * height), foil_paint
-        )
+    clouds = paint_shaded_clouds(glass, factor=1.25, scale=9.0, offset=offset)
+    outside = choose_paint_or_random(sampler, height, clouds, p_random=0.25)
+    outside = _sample_bottle_label(sampler, outside, height, shoulder)
+    outside = _sample_foil(sampler, outside, height, offset)
+    cap_color = sampler.sample_color("c9a24b", "d0d0d0", "b5442e", "22262b")
     return {
         "outside": outside,
         "inside": paint_solid_color(scale_brightness(glass, 0.6)),
         "base": paint_solid_color(glass),
-        "cap": paint_solid_color(
-            sampler.sample_color("c9a24b", "d0d0d0", "b5442e", "22262b")
-        ),
+        "cap": paint_solid_color(cap_color),
     }
+
+
+def _sample_bottle_label(
+    sampler: ParameterSampler, glass: Paint, height: float, shoulder: float
+) -> Paint:
+    """Sample the label of a bottle, which four of five bottles have.
+
+    Args:
+        sampler: samples colors and size.
+        glass: paint of the bottle.
+        height: height of the bottle.
+        shoulder: height at which the body begins to narrow; the label ends below.
+    """
+    paper = sampler.sample_color("efe6cf", "f5f2ea", "20242a", "c9a24b", p_random=0.3)
+    ink = sampler.sample_color("7a1f2b", "23395d", "2e2a25", "b08d3c", p_random=0.3)
+    bottom = 0.14 * height
+    top = min(sampler(0.44, low=0.3, high=0.5) * height, shoulder - 1.5)
+    has_label = not sampler.sample_bool(0.2)
+    if not has_label:
+        return glass
+    return _add_label(sampler, glass, paper, ink, bottom, top)
+
+
+def _sample_foil(
+    sampler: ParameterSampler, surface: Paint, height: float, offset: Array
+) -> Paint:
+    """Paint foil around the neck of half of all bottles.
+
+    Args:
+        sampler: samples the color.
+        surface: paint of the bottle.
+        height: height of the bottle.
+        offset: (3,) into the noise.
+    """
+    foil = sampler.sample_color("6d1a26", "b08d3c", "1c1f24", "23395d", "d5d5d5")
+    if not sampler.sample_bool(0.5, canonical=True):
+        return surface
+    bright_foil = scale_brightness(foil, 1.3)
+    foil_paint = add_specks(
+        paint_solid_color(foil), bright_foil, scale=0.5, offset=offset
+    )
+    return paint_over(surface, make_range_mask(height * 0.8, 2 * height), foil_paint)
 
 
 def _cap(sampler: ParameterSampler, radius: float, bottle_height: float) -> list[Patch]:
@@ -571,6 +663,32 @@ def _cap(sampler: ParameterSampler, radius: float, bottle_height: float) -> list
     )
 
 
+class _Label(NamedTuple):
+    """A label around a bottle.
+
+    Attributes:
+        half_angle: degrees from its middle to its sides.
+        bottom, top: heights of its edges.
+    """
+
+    half_angle: float
+    bottom: float
+    top: float
+
+    @property
+    def height(self) -> float:
+        """Height of the label."""
+        return self.top - self.bottom
+
+    @property
+    def half_text_angle(self) -> float:
+        """Degrees from its middle to the sides of text as wide as possible.
+
+        Text stays on the half of the bottle that is seen from the front.
+        """
+        return min(self.half_angle, 95.0)
+
+
 def _add_label(
     sampler: ParameterSampler,
     surface: Paint,
@@ -590,44 +708,61 @@ def _add_label(
         paper, ink: colors.
         bottom, top: heights of its edges.
     """
-    # degrees from the middle of the label to its sides
-    half_angle = sampler(95.0, low=60.0, high=180.0)
-    # text stays on the half of the bottle that is seen from the front
-    half_text_angle = min(half_angle, 95.0)
-    height = top - bottom
-
-    def add(
-        base: Paint, half_width: float, low: float, high: float, color: Array
-    ) -> Paint:
-        """Paint a rectangle of the label, `half_width` in degrees, over a paint."""
-        mask = make_facing_mask(
-            LABEL_AZIMUTH, half_width=half_width, low=low, high=high, soft=0.05
-        )
-        return paint_over(base, mask, paint_solid_color(color))
-
+    label = _Label(sampler(95.0, low=60.0, high=180.0), bottom, top)
     background = make_facing_mask(
-        LABEL_AZIMUTH, half_width=half_angle, low=bottom, high=top, soft=0.08
+        LABEL_AZIMUTH, half_width=label.half_angle, low=bottom, high=top, soft=0.08
     )
-    label = paint_over(surface, background, paint_solid_color(paper))
-    half_bar_angle = half_angle - 6.0
-    label = add(label, half_bar_angle, top - 0.12 * height, top - 0.07 * height, ink)
-    label = add(
-        label, half_bar_angle, bottom + 0.06 * height, bottom + 0.1 * height, ink
+    paint = paint_over(surface, background, paint_solid_color(paper))
+    paint = _add_bars(paint, label, ink)
+    paint = _add_text(paint, label, ink)
+    return paint_over(paint, _seal(bottom, label.height), paint_solid_color("b08d3c"))
+
+
+def _add_bars(base: Paint, label: _Label, ink: Array) -> Paint:
+    """Paint a bar of a color near the upper and near the lower edge of a label."""
+    half_angle = label.half_angle - 6.0
+    height = label.height
+    upper_edge = label.top - 0.07 * height
+    lower_edge = label.bottom + 0.06 * height
+    paint = _add_rectangle(base, half_angle, label.top - 0.12 * height, upper_edge, ink)
+    return _add_rectangle(
+        paint, half_angle, lower_edge, label.bottom + 0.1 * height, ink
     )
-    label = add(
-        label,
-        0.42 * half_text_angle,
+
+
+def _add_text(base: Paint, label: _Label, ink: Array) -> Paint:
+    """Paint a title and three lines of text, each of another length, as bars."""
+    bottom = label.bottom
+    height = label.height
+    paint = _add_rectangle(
+        base,
+        0.42 * label.half_text_angle,
         bottom + 0.6 * height,
         bottom + 0.76 * height,
         scale_brightness(ink, 0.8),
     )
-    # lines of text, each of another length
     for i, relative_length in enumerate((0.5, 0.36, 0.44)):
+        half_angle = relative_length * label.half_text_angle
         z = bottom + (0.5 - 0.1 * i) * height
-        label = add(
-            label, relative_length * half_text_angle, z, z + 0.035 * height, ink
-        )
-    return paint_over(label, _seal(bottom, height), paint_solid_color("b08d3c"))
+        paint = _add_rectangle(paint, half_angle, z, z + 0.035 * height, ink)
+    return paint
+
+
+def _add_rectangle(
+    base: Paint, half_width: float, low: float, high: float, color: Array
+) -> Paint:
+    """Paint a rectangle of a label over a paint.
+
+    Args:
+        base: the paint.
+        half_width: degrees from the middle of the label to its sides.
+        low, high: heights.
+        color: color (3,) of the rectangle.
+    """
+    mask = make_facing_mask(
+        LABEL_AZIMUTH, half_width=half_width, low=low, high=high, soft=0.05
+    )
+    return paint_over(base, mask, paint_solid_color(color))
 
 
 @painter
@@ -670,24 +805,28 @@ def vase(sampler: ParameterSampler) -> Instance:
     height = 24.0
     body = _vase_body(sampler, height)
     patches = [*body.patches, *_vase_handles(sampler, body)]
+    return Instance(
+        shapes.transform_patches(patches, SEAM_ROTATION),
+        _vase_paints(sampler, height),
+        sample_material(sampler, roughness=0.25, clearcoat=0.6),
+        texel_density={"inside": 0.35, "base": 0.5},
+    )
+
+
+def _vase_paints(sampler: ParameterSampler, height: float) -> dict[str, Paint]:
+    """Sample the paints of a vase of a height, by the tags of its parts."""
     offset = sampler.sample_noise_offset()
     clay = sampler.sample_color(
         "f2f1ea", "b7562f", "2f6f6a", "26303c", "d9c7a5", "8a2f2a"
     )
     glaze = paint_shaded_clouds(clay, factor=0.95, scale=4.0, offset=offset)
     decoration = _vase_paint(sampler, glaze, height, offset)
-    paints = {
+    return {
         "outside": choose_paint_or_random(sampler, height, decoration),
         "inside": paint_solid_color(scale_brightness(clay, 0.8)),
         "base": paint_solid_color("b79b7c"),
         "handle": glaze,
     }
-    return Instance(
-        shapes.transform_patches(patches, SEAM_ROTATION),
-        paints,
-        sample_material(sampler, roughness=0.25, clearcoat=0.6),
-        texel_density={"inside": 0.35, "base": 0.5},
-    )
 
 
 def _vase_body(sampler: ParameterSampler, height: float) -> _VaseBody:
@@ -744,6 +883,17 @@ def _vase_handles(sampler: ParameterSampler, body: _VaseBody) -> list[Patch]:
     ]
 
 
+INK_RINGS = (
+    (0.05, 0.08),
+    (0.18, 0.2),
+    (0.215, 0.225),
+    (0.76, 0.77),
+    (0.785, 0.805),
+    (0.96, 2.0),
+)
+"""Lower and upper edges of rings of ink around a vase, as fractions of its height."""
+
+
 def _vase_paint(
     sampler: ParameterSampler, glaze: Paint, height: float, offset: Array
 ) -> Paint:
@@ -763,20 +913,9 @@ def _vase_paint(
         accent = paint_shaded_clouds(ink, factor=1.3, scale=3.0, offset=offset)
         return _ceramic(sampler, height, glaze, accent)
     paint = paint_over(glaze, _scroll(height), paint_solid_color(ink))
-    # rings of ink, as fractions of the height
-    for low, high in (
-        (0.05, 0.08),
-        (0.18, 0.2),
-        (0.215, 0.225),
-        (0.76, 0.77),
-        (0.785, 0.805),
-        (0.96, 2.0),
-    ):
-        paint = paint_over(
-            paint,
-            make_range_mask(low * height, high * height, soft=0.12),
-            paint_solid_color(ink),
-        )
+    for low, high in INK_RINGS:
+        ring = make_range_mask(low * height, high * height, soft=0.12)
+        paint = paint_over(paint, ring, paint_solid_color(ink))
     return paint_over(paint, _frieze(height), paint_solid_color(ink))
 
 
@@ -906,6 +1045,23 @@ def _glass_profile(
     inner, lip = _glass_lip(glass)
     floor = glass.bottom + 0.08 * glass.depth
     floor_edge = (inner[-1, 0] * 0.6, floor + 0.25 * (inner[-1, 1] - floor))
+    return [
+        *_glass_foot(glass, foot_radius, stem_radius),
+        ("bowl", np.concatenate([glass.outer, lip, inner[:1]])),
+        ("inside", inner),
+        ("inside", np.array([inner[-1], floor_edge, (0.0, floor)])),
+    ]
+
+
+def _glass_foot(
+    glass: _GlassBowl, foot_radius: float, stem_radius: float
+) -> list[tuple[str, Array]]:
+    """Return the tags and profiles of the foot and the stem of a wine glass, outwards.
+
+    Args:
+        glass: the bowl on top of the stem.
+        foot_radius, stem_radius: radii of the foot and of the stem.
+    """
     under = [
         (0.0, 0.12),
         (foot_radius * 0.8, 0.12),
@@ -919,18 +1075,16 @@ def _glass_profile(
         (stem_radius * 1.15, 2.4),
         (stem_radius, 0.6 * glass.bottom),
     ]
-    upper_side = [
-        under[-1],
-        (foot_radius, 0.08),
-        *shapes.sample_spline(rising, count=14),
-    ]
+    stem = shapes.sample_spline(rising, count=14)
+    upper_side = [under[-1], (foot_radius, 0.08), *stem]
     return [
         ("foot", shapes.subdivide(under, longest=1.5)),
         ("foot", np.array(upper_side)),
-        ("bowl", np.concatenate([glass.outer, lip, inner[:1]])),
-        ("inside", inner),
-        ("inside", np.array([inner[-1], floor_edge, (0.0, floor)])),
     ]
+
+
+TINTS = ("c4dbe2", "d9e4e6", "e8d9c8", "8fb8a8", "c58a94", "7c9cc4", "f0f0ee")
+"""Colors of glass."""
 
 
 def _glass_paints(
@@ -938,25 +1092,13 @@ def _glass_paints(
 ) -> dict[str, Paint]:
     """Sample the paints of a wine glass, which often has wine in it.
 
-    The glass is not transparent: wine is painted on its outside and its inside, up to a
-    level.
-
     Args:
         sampler: samples the paints.
         stem_height: height at which the bowl begins.
         depth: depth of the bowl.
     """
     height = stem_height + depth
-    tint = sampler.sample_color(
-        "c4dbe2",
-        "d9e4e6",
-        "e8d9c8",
-        "8fb8a8",
-        "c58a94",
-        "7c9cc4",
-        "f0f0ee",
-        p_random=0.3,
-    )
+    tint = sampler.sample_color(*TINTS, p_random=0.3)
     drink = sampler.sample_color("6d1526", "d8b45a", "c46a6a", "3f1420", p_random=0.15)
     level = stem_height + depth * sampler(0.48, low=0.3, high=0.62)
     glass = gradient(
@@ -965,21 +1107,62 @@ def _glass_paints(
     outside = glass
     inside = glass
     if sampler.sample_bool(0.5, canonical=True):  # filled
-        wine = paint_shaded_clouds(
-            drink, factor=0.8, scale=3.0, offset=sampler.sample_noise_offset()
-        )
-        is_wine = make_range_mask(stem_height + 0.06 * depth, level, soft=0.1)
-        outside = paint_over(glass, is_wine, wine)
-        inside = paint_over(
-            glass, make_range_mask(0.0, level, soft=0.1), paint_solid_color(drink)
-        )
+        bottom = stem_height + 0.06 * depth
+        outside, inside = _fill_with_wine(sampler, glass, drink, bottom, level)
     outside = choose_paint_or_random(sampler, height, outside, p_random=0.3)
-    if sampler.sample_bool(0.2, canonical=True):  # a golden rim
-        is_rim = make_range_mask(height - 0.35, 2 * height, soft=0.1)
-        outside = paint_over(outside, is_rim, paint_solid_color("c9a24b"))
+    outside = _sample_golden_rim(sampler, outside, height)
+    foot = _sample_foot_paint(sampler, glass, outside, height)
+    return {"foot": foot, "bowl": outside, "inside": inside}
+
+
+def _sample_golden_rim(sampler: ParameterSampler, paint: Paint, height: float) -> Paint:
+    """Return the paint of a glass; the canonical and one in five have a golden rim.
+
+    Args:
+        sampler: decides at random.
+        paint: paint of the outside.
+        height: height of the glass.
+    """
+    if not sampler.sample_bool(0.2, canonical=True):
+        return paint
+    # twice the height: the mask reaches the top and farther
+    is_rim = make_range_mask(height - 0.35, 2 * height, soft=0.1)
+    return paint_over(paint, is_rim, paint_solid_color("c9a24b"))
+
+
+def _fill_with_wine(
+    sampler: ParameterSampler, glass: Paint, drink: Array, bottom: float, level: float
+) -> tuple[Paint, Paint]:
+    """Return the paints of the outside and the inside of a glass with wine.
+
+    The glass is not transparent: wine is painted on its outside and its inside, up to a
+    level.
+
+    Args:
+        sampler: samples the offset into the noise.
+        glass: paint of the glass.
+        drink: color (3,) of the wine.
+        bottom, level: heights at which the wine begins and ends.
+    """
+    offset = sampler.sample_noise_offset()
+    wine = paint_shaded_clouds(drink, factor=0.8, scale=3.0, offset=offset)
+    outside = paint_over(glass, make_range_mask(bottom, level, soft=0.1), wine)
+    is_filled = make_range_mask(0.0, level, soft=0.1)
+    return outside, paint_over(glass, is_filled, paint_solid_color(drink))
+
+
+def _sample_foot_paint(
+    sampler: ParameterSampler, glass: Paint, outside: Paint, height: float
+) -> Paint:
+    """Sample the paint of the foot of a wine glass: mostly glass, or as the bowl.
+
+    Args:
+        sampler: chooses the paint.
+        glass: paint of the glass.
+        outside: paint of the bowl.
+        height: height of the glass.
+    """
     if sampler.sample_bool(0.7, canonical=True):
         # `glass` is named twice, to be sampled twice as often
-        foot_paint = sampler.sample_choice(glass, outside, glass)
-    else:
-        foot_paint = sample_paint(sampler, height)
-    return {"foot": foot_paint, "bowl": outside, "inside": inside}
+        return sampler.sample_choice(glass, outside, glass)
+    return sample_paint(sampler, height)
