@@ -78,12 +78,7 @@ class AdversarialRun:
         # is not needed here.
         config = with_evaluation_only(AttackConfig.from_yaml(folder / CONFIG))
         problem, _warnings = problem_from_config(config)
-        # Conditions that vary at random, such as the camera, are those of the trial
-        # (verification render) whose image the run stores.
-        trial = summary.adversarial.trial
-        conditions_seed = None
-        if trial is not None:
-            conditions_seed = seeds.derive_seed(problem.seed, "verification", trial)
+        conditions_seed = _derive_conditions_seed(problem, summary.adversarial.trial)
         u = read_stored_configuration(folder, problem)
         return cls(folder, problem, problem.make_full_configuration(u, conditions_seed))
 
@@ -154,6 +149,19 @@ class AdversarialRun:
             return renderer.scene.input_assembler(renderer.space.inputs(self.u))
 
 
+def _derive_conditions_seed(problem: Problem, trial: int | None) -> int | None:
+    """Return the seed of the conditions that vary at random, such as the camera.
+
+    Args:
+        problem: the problem of the run.
+        trial: the trial (verification render) whose image the run stores; None without
+            one: then there is no seed.
+    """
+    if trial is None:
+        return None
+    return seeds.derive_seed(problem.seed, "verification", trial)
+
+
 BLEED = 3.0  # width of the color beyond the line to cut, in millimetres
 MAX_PIXEL_SIZE = 0.2
 """Maximum size of a printed pixel in millimetres. Larger texels are subdivided, and
@@ -204,27 +212,17 @@ def make_printable_pieces(run: str | Path, size: float) -> list[Piece]:
         InputError: nothing can be printed, or the size is out of range.
         FileFormatError: the run is of another kind, has not finished, or lacks files.
     """
-    if not 1.0 <= size <= MAX_OBJECT_SIZE:
-        raise InputError(
-            "size: expected the object's longest side in millimetres, 1 "
-            f"to {MAX_OBJECT_SIZE:.0f}, got {size}"
-        )
+    _check_printed_size(size)
     folder = find_run(run)
     summary = load_attack_summary(folder)
     config = AttackConfig.from_yaml(folder / CONFIG)
     scene = _load_object_scene(config)
     pieces = list[Piece]()
     for control in make_controls(config.controls):
-        file_stem = to_file_name(control.name)
-        texture_file = folder / ARTIFACTS / f"{file_stem}.png"
+        texture_file = folder / ARTIFACTS / f"{to_file_name(control.name)}.png"
         if control.kind == "patch":
-            pixels = read_png(folder / ARTIFACTS / f"{file_stem}-pixels.png")
             patch_size = size * _get_relative_patch_size(control, config, summary)
-            pixel_size = patch_size / len(pixels)  # as many rows as columns
-            name = f"{control.name}, {patch_size:.1f} mm a side"
-            pieces.append(
-                _make_piece(name, pixels, (pixel_size, pixel_size), inside=None)
-            )
+            pieces.append(_make_patch_piece(control, folder, patch_size))
         elif isinstance(control, TextureControl) and texture_file.is_file():
             pieces.extend(
                 _make_texture_pieces(control, scene.description, texture_file, size)
@@ -235,6 +233,34 @@ def make_printable_pieces(run: str | Path, size: float) -> list[Piece]:
             "to print"
         )
     return pieces
+
+
+def _check_printed_size(size: float) -> None:
+    """Check the longest side of the real object, in millimetres.
+
+    Raises:
+        InputError: it is out of range.
+    """
+    if not 1.0 <= size <= MAX_OBJECT_SIZE:
+        raise InputError(
+            "size: expected the object's longest side in millimetres, 1 "
+            f"to {MAX_OBJECT_SIZE:.0f}, got {size}"
+        )
+
+
+def _make_patch_piece(control: Control, folder: Path, patch_size: float) -> Piece:
+    """Return the piece of a patch, whose pixels the run stores.
+
+    Args:
+        control: control of the patch.
+        folder: folder of the run.
+        patch_size: width and height of the patch in millimetres.
+    """
+    file_stem = to_file_name(control.name)
+    pixels = read_png(folder / ARTIFACTS / f"{file_stem}-pixels.png")
+    pixel_size = patch_size / len(pixels)  # as many rows as columns
+    name = f"{control.name}, {patch_size:.1f} mm a side"
+    return _make_piece(name, pixels, (pixel_size, pixel_size), inside=None)
 
 
 def _make_texture_pieces(
@@ -286,7 +312,11 @@ def _get_relative_patch_size(
         size = config.controls.get(control.name, {}).get("size")
     if isinstance(size, (int, float)):
         return float(size)
-    # not set, or a range
+    return _get_default_patch_size(control)  # not set, or a range
+
+
+def _get_default_patch_size(control: Control) -> float:
+    """Return the default size of a patch, as a fraction of the object's size."""
     default = next(
         parameter.default
         for parameter in control.parameters
@@ -330,9 +360,19 @@ def _find_charts(
             image = image[:, ::-1]
             inside = inside[:, ::-1]
         title = name if len(charts) == 1 else f"{name}, piece {number}"
-        if distortion >= 0.005:  # half a percent: less is rounded to 0 %
-            title += f" (sizes within it differ by {100 * distortion:.0f} %)"
+        title += _describe_distortion(distortion)
         yield _make_piece(title, image, texel_size, inside)
+
+
+def _describe_distortion(distortion: float) -> str:
+    """Return by how much the sizes of texels differ, for a title; "" if they are equal.
+
+    Args:
+        distortion: coefficient of variation of the sizes.
+    """
+    if distortion >= 0.005:  # half a percent: less is rounded to 0 %
+        return f" (sizes within it differ by {100 * distortion:.0f} %)"
+    return ""
 
 
 def _label_charts(is_printed: Mask) -> list[tuple[tuple[slice, slice], Mask]]:
@@ -376,13 +416,10 @@ def _measure_texel_size(
         these distances. None if the part is a line or a point of texels, which has no
         area to print.
     """
-    distances_by_axis = []
-    for axis in (1, 0):  # along rows (width), then along columns (height)
-        # one distance for each texel that has a next texel along the axis
-        distances = np.linalg.norm(np.diff(positions, axis=axis), axis=-1)
-        is_inside = np.delete(inside, -1, axis)  # all but the last texel
-        is_next_inside = np.delete(inside, 0, axis)  # all but the first texel
-        distances_by_axis.append(distances[is_inside & is_next_inside])
+    # along rows (width), then along columns (height)
+    distances_by_axis = [
+        _measure_texel_distances(positions, inside, axis) for axis in (1, 0)
+    ]
     has_both = all(len(distances) > 0 for distances in distances_by_axis)
     if not has_both:  # the texels are a line or a point
         return None
@@ -393,6 +430,24 @@ def _measure_texel_size(
         float(np.std(distances) / np.mean(distances)) for distances in distances_by_axis
     )
     return (width, height), distortion
+
+
+def _measure_texel_distances(
+    positions: Float64Array, inside: Mask, axis: int
+) -> Float64Array:
+    """Return the distances (n,) of the texels of a part to the next along an axis.
+
+    Args:
+        positions: (h, w, 3) of the texels.
+        inside: (h, w) bool, the texels of the part.
+        axis: 0 along columns, 1 along rows.
+    """
+    # one distance for each texel that has a next texel along the axis
+    distances = np.linalg.norm(np.diff(positions, axis=axis), axis=-1)
+    is_inside = np.delete(inside, -1, axis)  # all but the last texel
+    is_next_inside = np.delete(inside, 0, axis)  # all but the first texel
+    part_distances: Float64Array = distances[is_inside & is_next_inside]
+    return part_distances
 
 
 def _make_piece(
@@ -411,10 +466,7 @@ def _make_piece(
             image.
     """
     subdivisions = _count_subdivisions(max(pixel_size))
-    if subdivisions > 1:
-        fine = enlarge(torch.from_numpy(np.ascontiguousarray(image)), subdivisions)
-    else:
-        fine = torch.from_numpy(image)
+    fine = _subdivide_pixels(image, subdivisions)
     fine_width = pixel_size[0] / subdivisions
     fine_height = pixel_size[1] / subdivisions
     bleed_columns = math.ceil(BLEED / fine_width)
@@ -433,6 +485,13 @@ def _make_piece(
         bleed=(bleed_columns, bleed_rows),
         cut_mask=mask,
     )
+
+
+def _subdivide_pixels(image: Float32Array, subdivisions: int) -> Tensor:
+    """Return an image (h, w, 3) with each pixel divided along both axes."""
+    if subdivisions > 1:
+        return enlarge(torch.from_numpy(np.ascontiguousarray(image)), subdivisions)
+    return torch.from_numpy(image)
 
 
 def _count_subdivisions(pixel_size: float) -> int:
