@@ -122,9 +122,15 @@ def find_similar_names(name: str, known: Iterable[str]) -> list[str]:
             ranks[known_name] = rank
     if ranks:
         return sorted(ranks, key=ranks.__getitem__)
+    return _find_similar_spellings(name, names)
+
+
+def _find_similar_spellings(name: str, known_names: Sequence[str]) -> list[str]:
+    """Return the known names that are spelled like a name, the most similar first."""
     matcher = difflib.SequenceMatcher(None, "", name.casefold())
     similarity_by_name = {
-        known_name: _compute_similarity(matcher, known_name) for known_name in names
+        known_name: _compute_similarity(matcher, known_name)
+        for known_name in known_names
     }
     similar = [name for name, value in similarity_by_name.items() if value > 0.0]
     return sorted(similar, key=similarity_by_name.__getitem__, reverse=True)
