@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import inspect
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -170,30 +170,34 @@ class RunContext(ExitStack, Generic[Settings]):
             fields: other fields by name. `seconds` may have the times of stages; the
                 total is added if it is not among them.
         """
-        settings = self.config
+        # a total in `fields` replaces this one
+        seconds = {
+            "total": time.perf_counter() - self._start_time,
+            **fields.pop("seconds", {}),
+        }
+        shared = self._collect_shared_fields()
+        shared |= {
+            "run": str(self.run.path),
+            "ending": self.ending,
+            "seconds": seconds,
+            "command_line": self.config.command_line(self.run.path),
+            "python_only": self.config.python_only,
+        }
+        return result_type(**{**shared, **fields})
+
+    def _collect_shared_fields(self) -> dict[str, Any]:
+        """Return those fields of a result that are values of the settings."""
         shared = {
-            name: getattr(settings, attribute)
+            name: getattr(self.config, attribute)
             for name, attribute in SHARED_RESULT_FIELDS.items()
-            if hasattr(settings, attribute)
+            if hasattr(self.config, attribute)
         }
         # Results have lists of names; in the settings, objects are a tuple and controls
         # a mapping by name.
         for name in ("objects", "controls"):
             if name in shared:
                 shared[name] = list(shared[name])
-        # a total in `fields` replaces this one
-        seconds = {
-            "total": time.perf_counter() - self._start_time,
-            **fields.pop("seconds", {}),
-        }
-        shared |= {
-            "run": str(self.run.path),
-            "ending": self.ending,
-            "seconds": seconds,
-            "command_line": settings.command_line(self.run.path),
-            "python_only": settings.python_only,
-        }
-        return result_type(**{**shared, **fields})
+        return shared
 
 
 def run_and_save(
@@ -418,7 +422,7 @@ class Experiment(Generic[AnyResult]):
         signature that `help` displays for the experiment.
         """
         # only Python callers need it; imports torch
-        from advsearch.api.keywords import make_config, with_settings_signature
+        from advsearch.api.keywords import with_settings_signature
 
         object_parameters = self._find_python_arguments()
 
@@ -426,25 +430,8 @@ class Experiment(Generic[AnyResult]):
             *args: Any, progress: Any = None, resume: bool = False, **settings: Any
         ) -> AnyResult:
             positional = dict(zip(self.positional_args, args, strict=False))
-            values = {**positional, **settings}
-            # Objects that settings cannot hold are passed directly to the experiment's
-            # function. A positional setting may be such an object; its name is still
-            # stored in the settings, so it is passed to both.
-            arguments = {
-                name: values[name] for name in object_parameters if name in values
-            }
-            config_values = {
-                name: value
-                for name, value in values.items()
-                if name not in object_parameters or name in self.positional_args
-            }
-            config = make_config(self.settings, **config_values)
-            resumed = find_stopped_run(config) if resume else None
-            return self.run(
-                config,
-                progress=as_progress(progress),
-                resumed_directory=resumed,
-                **arguments,
+            return self._run_from_python(
+                {**positional, **settings}, object_parameters, progress, resume=resume
             )
 
         # `with_settings_signature` reads the signature, and adds the other settings.
@@ -455,6 +442,43 @@ class Experiment(Generic[AnyResult]):
         function.__doc__ = self.function.__doc__
         function.__module__ = self.function.__module__
         return with_settings_signature(self.settings)(function)
+
+    def _run_from_python(
+        self,
+        values: Mapping[str, Any],
+        object_names: Collection[str],
+        progress: Any,
+        *,
+        resume: bool,
+    ) -> AnyResult:
+        """Run the experiment with the arguments of a Python caller.
+
+        Args:
+            values: settings, and objects that settings cannot hold, by name.
+            object_names: names of arguments that may be such objects.
+            progress: the argument `progress`.
+            resume: whether to continue the run that `run` names.
+        """
+        # only Python callers need it; imports torch
+        from advsearch.api.keywords import make_config
+
+        # Objects that settings cannot hold are passed directly to the experiment's
+        # function. A positional setting may be such an object; its name is still stored
+        # in the settings, so it is passed to both.
+        arguments = {name: values[name] for name in object_names if name in values}
+        config_values = {
+            name: value
+            for name, value in values.items()
+            if name not in object_names or name in self.positional_args
+        }
+        config = make_config(self.settings, **config_values)
+        resumed = find_stopped_run(config) if resume else None
+        return self.run(
+            config,
+            progress=as_progress(progress),
+            resumed_directory=resumed,
+            **arguments,
+        )
 
     def _make_signature(
         self, object_parameters: Mapping[str, inspect.Parameter]
@@ -481,12 +505,10 @@ class Experiment(Generic[AnyResult]):
             parameters.append(
                 make("resume", make.KEYWORD_ONLY, default=False, annotation="bool")
             )
-        parameters.append(
-            make(
-                "progress", make.KEYWORD_ONLY, default=None, annotation="ProgressOption"
-            )
+        progress = make(
+            "progress", make.KEYWORD_ONLY, default=None, annotation="ProgressOption"
         )
-        parameters.append(make("settings", make.VAR_KEYWORD))
+        parameters += [progress, make("settings", make.VAR_KEYWORD)]
         return inspect.Signature(parameters, return_annotation=self.result.__name__)
 
     def _find_python_arguments(self) -> dict[str, inspect.Parameter]:
