@@ -7,7 +7,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, Field, fields
 from enum import Enum
 from pathlib import Path
@@ -44,18 +44,11 @@ def group_mitsuba_keys(controls: Mapping[str, object]) -> dict[str, object]:
     ranges = dict[str, object]()
     for name, options in controls.items():
         kind, colon, key = str(name).partition(":")
-        is_mitsuba_key = kind == MITSUBA_CONTROL and bool(colon)
-        # a control without options has None, {} or ""
-        has_range = options is not None and options not in ({}, "")
-        if not is_mitsuba_key:
-            plain[name] = _with_parameter(str(name), options)
-        elif not key or not has_range:
-            raise InputError(
-                f"`controls` {name}: expected a range, as in "
-                f"{MITSUBA_CONTROL}:{key or 'KEY'}=[0.2, 0.8]"
-            )
-        else:
+        if kind == MITSUBA_CONTROL and colon:
+            _check_mitsuba_range(name, key, options)
             ranges[key] = options
+        else:
+            plain[name] = _with_parameter(str(name), options)
     if not ranges:
         return plain
     grouped = plain.get(MITSUBA_CONTROL) or {}
@@ -65,6 +58,26 @@ def group_mitsuba_keys(controls: Mapping[str, object]) -> dict[str, object]:
             "with a range"
         )
     return {**plain, MITSUBA_CONTROL: {**grouped, **ranges}}
+
+
+def _check_mitsuba_range(name: str, key: str, options: object) -> None:
+    """Check that a key of Mitsuba's scene parameters is there, and has a range.
+
+    Args:
+        name: the control, "mitsuba:KEY".
+        key: the key.
+        options: the range.
+
+    Raises:
+        InputError: one of them is missing.
+    """
+    # a control without options has None, {} or ""
+    has_range = options is not None and options not in ({}, "")
+    if not key or not has_range:
+        raise InputError(
+            f"`controls` {name}: expected a range, as in "
+            f"{MITSUBA_CONTROL}:{key or 'KEY'}=[0.2, 0.8]"
+        )
 
 
 def _with_parameter(name: str, options: object) -> object:
@@ -95,12 +108,7 @@ def format_things(things: object) -> str | None:
     Raises:
         InputError: the value has another type.
     """
-    if things is None:
-        items: Iterable[object] = []
-    elif isinstance(things, (list, tuple)):
-        items = things
-    else:
-        items = [things]
+    items = _list_items(things)
     if not all(isinstance(item, (str, Mapping)) for item in items):
         raise InputError(
             "things: expected a text such as 'car@12,3.5', a mapping or a list of "
@@ -112,6 +120,15 @@ def format_things(things: object) -> str | None:
     )
     texts = [_make_thing_absolute(part) for part in text.split(";") if part.strip()]
     return "; ".join(texts) or None
+
+
+def _list_items(things: object) -> Sequence[object]:
+    """Return the items of a list, or a single item as a list; for None an empty one."""
+    if things is None:
+        return []
+    if isinstance(things, (list, tuple)):
+        return things
+    return [things]
 
 
 def _make_thing_absolute(thing: str) -> str:
