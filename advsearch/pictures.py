@@ -162,14 +162,11 @@ def to_8bit_levels(image: Image.Image, *, alpha: bool) -> npt.NDArray[np.uint8]:
     Returns:
         (H, W, 3) uint8, or (H, W, 4) with alpha.
     """
-    is_float = image.mode == "F"
-    is_16bit = image.mode.startswith("I")
     levels: npt.NDArray[np.uint8]
-    if is_float or is_16bit:  # gray
-        white = np.float32(1.0 if is_float else 65535.0)
-        gray = np.nan_to_num(np.asarray(image, np.float32)) / white
-        levels = np.round(np.clip(gray, 0.0, 1.0) * 255.0).astype(np.uint8)
-        levels = levels[:, :, None].repeat(3, axis=2)  # three equal channels
+    if image.mode == "F":
+        levels = _convert_gray(image, white=1.0)
+    elif image.mode.startswith("I"):
+        levels = _convert_gray(image, white=65535.0)
     else:
         has_transparent_color = "transparency" in image.info
         mode = "RGBA" if alpha or has_transparent_color else "RGB"
@@ -179,6 +176,18 @@ def to_8bit_levels(image: Image.Image, *, alpha: bool) -> npt.NDArray[np.uint8]:
         opaque = np.full_like(levels[:, :, :1], 255)
         levels = np.concatenate([levels, opaque], axis=2)
     return levels if alpha else levels[:, :, :3]
+
+
+def _convert_gray(image: Image.Image, *, white: float) -> npt.NDArray[np.uint8]:
+    """Return a gray image in 8 bits with three equal channels, (H, W, 3).
+
+    Args:
+        image: image with one channel.
+        white: its level of white.
+    """
+    gray = np.nan_to_num(np.asarray(image, np.float32)) / np.float32(white)
+    levels = np.round(np.clip(gray, 0.0, 1.0) * 255.0).astype(np.uint8)
+    return levels[:, :, None].repeat(3, axis=2)
 
 
 def _count_scans(image: Image.Image) -> int:
