@@ -76,24 +76,26 @@ def render_figure(
     # late: matplotlib takes long to import
     import matplotlib.figure
 
-    files = {}
     with matplotlib.rc_context({**STYLE, **(style or {})}), warnings.catch_warnings():
         # matplotlib warns of letters that its font lacks. An SVG contains the text
         # itself, and a browser draws it with another font.
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
         figure = matplotlib.figure.Figure(figsize=size, layout="constrained")
         draw(figure)
-        for kind in kinds:
-            stream = io.BytesIO()
-            figure.savefig(
-                stream,
-                format=kind,
-                dpi=150,
-                # without a date, the same figure always gives the same file
-                metadata={"Date": None} if kind == "svg" else None,
-            )
-            files[kind] = stream.getvalue()
-    return files
+        return {kind: _encode_figure(figure, kind) for kind in kinds}
+
+
+def _encode_figure(figure: Figure, kind: str) -> bytes:
+    """Return a figure as the content of a file; `kind` is its suffix, png or svg."""
+    stream = io.BytesIO()
+    figure.savefig(
+        stream,
+        format=kind,
+        dpi=150,
+        # without a date, the same figure always gives the same file
+        metadata={"Date": None} if kind == "svg" else None,
+    )
+    return stream.getvalue()
 
 
 SERIES = (BLUE, RED, "#1f7a45", "#b4540a", "#6b3fa0", GREY)
@@ -123,21 +125,43 @@ def draw_fractions(
         colour = colours[index % len(colours)]
         mark = MARKS[index % len(MARKS)]
         offset = (index - (len(series) - 1) / 2) * spacing
-        for row, row_fractions in enumerate(rows.values()):
-            y = row + offset
-            fraction_and_interval = row_fractions[index]
-            if fraction_and_interval is None:
-                continue
-            fraction, interval = fraction_and_interval
-            axes.plot(interval, [y] * 2, color=colour, alpha=0.45, linewidth=3)
-            axes.plot(fraction, y, mark, color=colour, ms=5, label=label)
-            # Only the first dot of a series has its label, so that the legend has it
-            # once; matplotlib leaves out labels that begin with "_".
-            label = "_"
+        fractions = [
+            (row + offset, row_fractions[index])
+            for row, row_fractions in enumerate(rows.values())
+        ]
+        _draw_series(axes, fractions, label, colour, mark)
     axes.set_yticks(range(len(rows)), list(rows))
     # upside down: the first row is at the top
     axes.set(xlim=(-0.03, 1.03), ylim=(len(rows) - 0.4, -0.6))
     axes.grid(True, axis="x")
+
+
+def _draw_series(
+    axes: Any,
+    fractions: Sequence[tuple[float, tuple[float, Sequence[float]] | None]],
+    label: str,
+    colour: str,
+    mark: str,
+) -> None:
+    """Draw the fractions of one series, with their intervals.
+
+    Args:
+        axes: axes of matplotlib, on which it is drawn.
+        fractions: the height y of each row, and its fraction with the two bounds of its
+            interval, or None to draw nothing.
+        label: name of the series, for the legend.
+        colour: its color.
+        mark: its marker.
+    """
+    for y, fraction_and_interval in fractions:
+        if fraction_and_interval is None:
+            continue
+        fraction, interval = fraction_and_interval
+        axes.plot(interval, [y] * 2, color=colour, alpha=0.45, linewidth=3)
+        axes.plot(fraction, y, mark, color=colour, ms=5, label=label)
+        # Only the first dot of a series has its label, so that the legend has it once;
+        # matplotlib leaves out labels that begin with "_".
+        label = "_"
 
 
 def draw_searches(
@@ -165,16 +189,7 @@ def draw_searches(
     ):
         _draw_search(axes, name, values, colour, dashes)
     if zero_means:
-        axes.axhline(0.0, color=GREY, linewidth=1, linestyle=(0.0, (5.0, 4.0)))
-        # at the right end of the zero line, 4 points above it
-        axes.annotate(
-            zero_means,
-            xy=(1.0, 0.0),
-            xytext=(-4, 4),
-            xycoords=axes.get_yaxis_transform(),
-            textcoords="offset points",
-            ha="right",
-        )
+        _draw_zero_line(axes, zero_means)
     axes.set(
         xlabel="evaluations",
         ylabel=meaning,
@@ -184,6 +199,20 @@ def draw_searches(
     axes.locator_params("x", integer=True)
     axes.grid(True, axis="y")
     axes.legend()
+
+
+def _draw_zero_line(axes: Any, text: str) -> None:
+    """Draw a dashed horizontal line at zero, with a text at its right end."""
+    axes.axhline(0.0, color=GREY, linewidth=1, linestyle=(0.0, (5.0, 4.0)))
+    # 4 points above the line
+    axes.annotate(
+        text,
+        xy=(1.0, 0.0),
+        xytext=(-4, 4),
+        xycoords=axes.get_yaxis_transform(),
+        textcoords="offset points",
+        ha="right",
+    )
 
 
 def _draw_search(
@@ -263,15 +292,7 @@ def draw_heat_map(
         x_label: the name of the horizontal axis.
         y_label: the name of the vertical axis.
     """
-    magnitudes = [abs(value) for row in values for value in row if math.isfinite(value)]
-    if meaning == ACCURACY:
-        lower = 0.0
-        upper = 1.0
-    else:
-        # The same limit on both sides, so that 0 has the middle colour. 1e-6: the range
-        # must not be empty.
-        upper = max([*magnitudes, 1e-6])
-        lower = -upper
+    lower, upper = _choose_map_limits(values, meaning)
     image = axes.imshow(
         values,
         origin="lower",
@@ -283,6 +304,24 @@ def draw_heat_map(
     )
     axes.set(xlabel=x_label, ylabel=y_label)
     axes.figure.colorbar(image, ax=axes, label=meaning)
+
+
+def _choose_map_limits(
+    values: Sequence[Sequence[float]], meaning: str
+) -> tuple[float, float]:
+    """Return the values of the first and the last color of a map.
+
+    Args:
+        values: values of the map.
+        meaning: meaning of the colors; `ACCURACY` has the range 0 to 1.
+    """
+    if meaning == ACCURACY:
+        return 0.0, 1.0
+    magnitudes = [abs(value) for row in values for value in row if math.isfinite(value)]
+    # The same limit on both sides, so that 0 has the middle colour. 1e-6: the range must
+    # not be empty.
+    upper = max([*magnitudes, 1e-6])
+    return -upper, upper
 
 
 def format_axis_title(name: str, unit: str) -> str:
@@ -342,9 +381,8 @@ def draw_marks(picture: Any, shapes: Sequence[Shape]) -> Floats:
     font = ImageFont.load_default(max(size) // LETTERS_PER_SIDE)
     _draw_boxes(image, shapes, factor, font)
     panels = [image, *_make_map_panels(shapes, size, font)]
-    sheet: Floats = np.hstack(
-        [np.asarray(panel, dtype=np.float32) for panel in panels]
-    ) / np.float32(255.0)
+    sheet_levels = np.hstack([np.asarray(panel, dtype=np.float32) for panel in panels])
+    sheet: Floats = sheet_levels / np.float32(255.0)
     return sheet
 
 
@@ -402,9 +440,8 @@ def _draw_boxes(
         if shape.box is not None
     ]
     for shape, corners in boxes:
-        draw.rectangle(
-            corners, outline=TRUE_COLOR if shape.true else PREDICTED_COLOR, width=2
-        )
+        color = TRUE_COLOR if shape.true else PREDICTED_COLOR
+        draw.rectangle(corners, outline=color, width=2)
     # Boxes of the texts that were written so far, which the next text must not cover.
     text_boxes: list[tuple[int, int, int, int]] = []
     for shape, corners in boxes:
@@ -435,16 +472,28 @@ def _make_map_panels(
     upper = float(maps[0].map.max())
     panels = []
     for shape in maps:
-        values = np.asarray(shape.map, dtype=np.float64)
-        value_range = max(upper - lower, 1e-12)  # not 0, for a constant map
-        greys = np.clip((values - lower) / value_range, 0.0, 1.0)
-        levels = np.rint(255.0 * np.nan_to_num(greys)).astype(np.uint8)
-        grey_image = Image.fromarray(levels).resize(size, Image.Resampling.NEAREST)
-        panel = grey_image.convert("RGB")
+        grey_image = _make_grey_image(shape.map, lower, upper)
+        panel = grey_image.resize(size, Image.Resampling.NEAREST).convert("RGB")
         frame = (0, 0, size[0] - 1, size[1] - 1)
         _write_label(ImageDraw.Draw(panel), shape, frame, size, font, [])
         panels.append(panel)
     return panels
+
+
+def _make_grey_image(values: Any, lower: float, upper: float) -> Image.Image:
+    """Return a map (h, w) as a gray image.
+
+    Args:
+        values: the map.
+        lower: the value that is black.
+        upper: the value that is white.
+    """
+    value_range = max(upper - lower, 1e-12)  # not 0, for a constant map
+    greys = np.clip(
+        (np.asarray(values, dtype=np.float64) - lower) / value_range, 0.0, 1.0
+    )
+    levels = np.rint(255.0 * np.nan_to_num(greys)).astype(np.uint8)
+    return Image.fromarray(levels)
 
 
 def _to_pixel_corners(
@@ -499,23 +548,39 @@ def _write_label(
     letters = [round(side) for side in draw.textbbox((0, 0), text, font=font)]
     width = letters[2] - letters[0] + 2 * LABEL_MARGIN
     height = letters[3] - letters[1] + 2 * LABEL_MARGIN
+    x, y = _choose_label_corner(shape, corners, (width, height), size, text_boxes)
+    background = TRUE_COLOR if shape.true else PREDICTED_COLOR
+    draw.rectangle((x, y, x + width, y + height), fill=background)
+    # The letters begin a little to the right of and below the position of the text.
+    position = (x + LABEL_MARGIN - letters[0], y + LABEL_MARGIN - letters[1])
+    draw.text(position, text, fill=(0, 0, 0), font=font)
+    return x, y, x + width, y + height
+
+
+def _choose_label_corner(
+    shape: Shape,
+    corners: tuple[int, int, int, int],
+    text_size: tuple[int, int],
+    size: tuple[int, int],
+    text_boxes: Sequence[tuple[int, int, int, int]],
+) -> tuple[int, int]:
+    """Return the upper left corner (x, y) of a text with its background.
+
+    Args:
+        shape: the shape that the text belongs to.
+        corners: (left, top, right, bottom) of the shape.
+        text_size: (width, height) of the text.
+        size: (width, height) of the image.
+        text_boxes: the boxes of texts written before.
+    """
+    width, height = text_size
     left, top, _, bottom = corners
     # the text begins at the left side of the shape, but stays inside of the image
     x = max(0, min(left, size[0] - width))
     max_y = max(0, size[1] - height)
     preferred_y = bottom if shape.true else top - height
     preferred_y = max(0, min(preferred_y, size[1] - height))
-    y = _find_free_height(x, preferred_y, max_y, (width, height), text_boxes)
-    background = TRUE_COLOR if shape.true else PREDICTED_COLOR
-    draw.rectangle((x, y, x + width, y + height), fill=background)
-    # The letters begin a little to the right of and below the position of the text.
-    draw.text(
-        (x + LABEL_MARGIN - letters[0], y + LABEL_MARGIN - letters[1]),
-        text,
-        fill=(0, 0, 0),
-        font=font,
-    )
-    return x, y, x + width, y + height
+    return x, _find_free_height(x, preferred_y, max_y, text_size, text_boxes)
 
 
 def _find_free_height(
@@ -583,9 +648,8 @@ def make_contact_sheet(
     n_columns = choose_column_count(len(pictures))
     n_rows = math.ceil(len(pictures) / n_columns)
     # one more gap is at the left and above
-    sheet = Image.new(
-        "RGB", (GAP + n_columns * cell_width, GAP + n_rows * cell_height), "white"
-    )
+    sheet_size = (GAP + n_columns * cell_width, GAP + n_rows * cell_height)
+    sheet = Image.new("RGB", sheet_size, "white")
     for index, picture in enumerate(pictures):
         row, column = divmod(index, n_columns)
         corner = (GAP + column * cell_width, GAP + row * cell_height)
