@@ -20,6 +20,7 @@ if TYPE_CHECKING:
         Formation,
         Interval,
         SharedWork,
+        TwinAgreement,
         TwinEvidence,
         VerifiedRate,
     )
@@ -210,6 +211,21 @@ def format_paired_rates(run: str, pair: Any) -> str:
     """
     clean = _format_accuracy(pair.clean)
     adversarial = _format_accuracy(pair.adversarial)
+    return (
+        f"{pair.model} is right in {clean} of the clean scene, and in {adversarial} "
+        f"with the adversarial scene of {run}: "
+        f"{_format_rate_difference(pair)}. "
+        f"Right in the clean one alone are {pair.clean_only} pairs, "
+        f"with the adversarial one alone {pair.adversarial_only}."
+    )
+
+
+def _format_rate_difference(pair: Any) -> str:
+    """Return the difference of paired rates in points, with its interval.
+
+    Args:
+        pair: `PairedRates`, whose difference is a fraction.
+    """
     lower, upper = (100.0 * bound for bound in pair.interval)
     if pair.difference < 0:
         # The word "fewer" states the sign. The bounds are negated, and so swap places.
@@ -223,12 +239,8 @@ def format_paired_rates(run: str, pair: Any) -> str:
     if contains_zero:
         doubt = "; that there is a difference is not shown"
     return (
-        f"{pair.model} is right in {clean} of the clean scene, and in {adversarial} "
-        f"with the adversarial scene of {run}: "
         f"{abs(100.0 * pair.difference):.0f} points {direction} "
-        f"(95 % interval of pairs {interval}){doubt}. "
-        f"Right in the clean one alone are {pair.clean_only} pairs, "
-        f"with the adversarial one alone {pair.adversarial_only}."
+        f"(95 % interval of pairs {interval}){doubt}"
     )
 
 
@@ -451,6 +463,17 @@ def format_mistake(
         # the label is "mug elsewhere": "sees a mug elsewhere, and none where this mug
         # is"
         return f"sees {add_article(label)}, and none where {thing} is"
+    return _format_wrong_label(task, thing, label)
+
+
+def _format_wrong_label(task: str, thing: str, label: str) -> str:
+    """Return the prediction of a wrong label as a clause.
+
+    Args:
+        task: task of the model.
+        thing: phrase for the object in the clause.
+        label: label that the model predicts.
+    """
     if task == CLASSIFICATION:
         return f"calls {thing} {add_article(label)}"
     if task == COMMAND:
@@ -665,12 +688,18 @@ def format_formation(
     )
     if formation.gain is not None:
         return f"{description}, gain {format_number(formation.gain)}"
+    description += ", a gain for each scene"
+    gain_text = _format_gains(gains or {})
+    return f"{description}: {gain_text}" if gain_text else description
+
+
+def _format_gains(gains: Mapping[str, float]) -> str:
+    """Return gains by scene as text: ``mug, studio 1.35; bowl, studio 1.2``."""
     gain_texts = []
-    for scene, gain in (gains or {}).items():
+    for scene, gain in gains.items():
         scene_name = ", ".join(map(shorten_name, scene.split(", ")))
         gain_texts.append(f"{scene_name} {format_number(gain)}")
-    description += ", a gain for each scene"
-    return f"{description}: {'; '.join(gain_texts)}" if gain_texts else description
+    return "; ".join(gain_texts)
 
 
 def format_number(value: Any) -> str:
@@ -739,16 +768,8 @@ def format_twin_evidence(evidence: TwinEvidence) -> str:
             f"How far this holds for photographs was not measured: "
             f"{_TWIN_MISMATCHES[evidence.match].format(run=name)}."
         )
-    objects = row.object or "all objects together"
-    if not evidence.same_object:
-        objects += ", not of this object"
-    surroundings = f"in the environment {row.surroundings}"
-    if row.surroundings == IN_PHOTOGRAPH:
-        surroundings = "composed over their photographs"
-    if not evidence.same_surroundings:
-        surroundings += ", not in these surroundings"
     agreement = (
-        f"Photographs ({name}; {objects}; renders {surroundings}): this model was "
+        f"Photographs ({name}; {_describe_twins(row, evidence)}): this model was "
         f"right or wrong on both in {format_estimate(row.agreement)} of "
         f"{format_count(row.pairs, 'pair')} of {format_count(row.frames, 'frame')}."
     )
@@ -763,6 +784,24 @@ def format_twin_evidence(evidence: TwinEvidence) -> str:
         f"{format_estimate(row.wrong_where_twin_wrong)} ({failing}); photographs failed "
         f"in {format_estimate(row.photo_wrong)} at all."
     )
+
+
+def _describe_twins(row: TwinAgreement, evidence: TwinEvidence) -> str:
+    """Return the objects and the surroundings of twins as text.
+
+    Args:
+        row: the row of the run of twins.
+        evidence: whether its object and surroundings are those of the result.
+    """
+    objects = row.object or "all objects together"
+    if not evidence.same_object:
+        objects += ", not of this object"
+    surroundings = f"in the environment {row.surroundings}"
+    if row.surroundings == IN_PHOTOGRAPH:
+        surroundings = "composed over their photographs"
+    if not evidence.same_surroundings:
+        surroundings += ", not in these surroundings"
+    return f"{objects}; renders {surroundings}"
 
 
 _TWIN_MISMATCHES = {
