@@ -122,14 +122,23 @@ def correlation_interval(
     value = statistic(first, second)
     if not math.isfinite(value) or not np.isfinite(values_without_unit).all():
         return None
-    z = _to_fisher_z(values_without_unit)
-    # variance by the jackknife (Efron and Stein 1981)
-    variance = (n_units - 1) / n_units * float(((z - z.mean()) ** 2).sum())
-    probability = (1.0 + CONFIDENCE) / 2.0  # 0.975 lies below the upper bound
-    half_width = float(stdtrit(n_units - 1, probability)) * math.sqrt(variance)
+    half_width = _compute_jackknife_half_width(_to_fisher_z(values_without_unit))
     center = float(_to_fisher_z(np.array(value)))
     # tanh turns Fisher's z into a coefficient again
     return math.tanh(center - half_width), math.tanh(center + half_width)
+
+
+def _compute_jackknife_half_width(z: npt.NDArray[np.float64]) -> float:
+    """Return half the width of the interval of a nearly normal value.
+
+    Args:
+        z: (m,) the value without each of m units.
+    """
+    n_units = len(z)
+    # variance by the jackknife (Efron and Stein 1981)
+    variance = (n_units - 1) / n_units * float(((z - z.mean()) ** 2).sum())
+    probability = (1.0 + CONFIDENCE) / 2.0  # 0.975 lies below the upper bound
+    return float(stdtrit(n_units - 1, probability)) * math.sqrt(variance)
 
 
 def _to_fisher_z(values: FloatArray) -> FloatArray:
