@@ -293,11 +293,32 @@ def one_sided_p_value(
             round(copies * float(right_outside.sum())),
             round(copies * float(rows_outside.sum())),
         )
+    return _clustered_p_value(
+        right_inside, rows_inside, right_outside, rows_outside, copies
+    )
+
+
+def _clustered_p_value(
+    right_inside: npt.NDArray[np.float64],
+    rows_inside: npt.NDArray[np.float64],
+    right_outside: npt.NDArray[np.float64],
+    rows_outside: npt.NDArray[np.float64],
+    copies: float,
+) -> float:
+    """Return the p-value of `one_sided_p_value` if units have several predictions.
+
+    Args:
+        right_inside: (n,) right predictions of each unit inside.
+        rows_inside: (n,) predictions of each unit inside.
+        right_outside: (n,) right predictions of each unit outside.
+        rows_outside: (n,) predictions of each unit outside.
+        copies: number by which all units are multiplied.
+    """
     # By unit. A unit that has predictions on both sides is cut by the rule.
     has_inside = rows_inside > 0.0
     has_outside = rows_outside > 0.0
     is_cut = bool((has_inside & has_outside).any())
-    are_equally_large = len(np.unique(unit_rows)) == 1
+    are_equally_large = len(np.unique(rows_inside + rows_outside)) == 1
     if not is_cut and are_equally_large:
         return _permutation_p_value(
             right_inside + right_outside,
