@@ -85,24 +85,47 @@ def find_dips(
         end = np.arange(near + 2, n_distances + 1)
         right_beyond = right_before[end] - right_before[near + 1]
         counts_beyond = counts_before[end] - counts_before[near + 1]
-        p_values = _compute_p_values(
+        clearest = _find_clearest_dip(
             right[near], counts[near], right_beyond, counts_beyond
         )
-        is_dip = right[near] / counts[near] < right_beyond / counts_beyond
-        if not is_dip.any():
+        if clearest is None:
             continue
-        # the range with the clearest difference
-        best = int(np.argmin(np.where(is_dip, p_values, np.inf)))
+        best, p_value = clearest
         dip = Dip(
             distance=float(distances[near]),
             counts=(int(right[near]), int(counts[near])),
             # last distance of the range: `best` counts from the one behind `near`
             until=float(distances[near + 1 + best]),
             counts_beyond=(int(right_beyond[best]), int(counts_beyond[best])),
-            p_value=min(1.0, float(p_values[best]) * n_comparisons),
+            p_value=min(1.0, p_value * n_comparisons),
         )
         dips.append(dip)
     return tuple(dips)
+
+
+def _find_clearest_dip(
+    right: np.int64,
+    count: np.int64,
+    right_beyond: NDArray[np.int64],
+    counts_beyond: NDArray[np.int64],
+) -> tuple[int, float] | None:
+    """Return the range beyond a distance with the clearest higher rate, and its p-value.
+
+    Args:
+        right: number of images with a right prediction at the distance.
+        count: number of images at the distance.
+        right_beyond: (k,) number of images with a right prediction in each range.
+        counts_beyond: (k,) number of images in each range.
+
+    Returns:
+        The index of the range, and its p-value; None if no range has a higher rate.
+    """
+    p_values = _compute_p_values(right, count, right_beyond, counts_beyond)
+    is_dip = right / count < right_beyond / counts_beyond
+    if not is_dip.any():
+        return None
+    best = int(np.argmin(np.where(is_dip, p_values, np.inf)))
+    return best, float(p_values[best])
 
 
 def _compute_p_values(
