@@ -228,26 +228,8 @@ def _assert_claim(
             workbench.allow_code_in_settings({"model": model})
         # the settings with names in place of objects, and the objects by these names
         suite_settings, objects = _name_objects(object, settings)
-        claim_settings = dict(claim)
-        for key, model in models.items():
-            model_name = workbench.get_model_name(model)
-            # "model" is a setting of the suite; "than" belongs to the claim
-            if key == "model":
-                suite_settings[key] = model_name
-            else:
-                claim_settings[key] = model_name
-            if not isinstance(model, (str, Path)):
-                objects["model", model_name] = model
-        # The stored run lists everything that its file cannot name, since it cannot be
-        # repeated from the file: the call itself, and models of this session only.
-        python_only = [
-            workbench.PythonOnly("call", f"of {title}"),
-            *(
-                workbench.PythonOnly("model", workbench.get_model_name(model))
-                for model in models.values()
-                if workbench.is_session_only(model)
-            ),
-        ]
+        claim_settings: dict[str, Any] = dict(claim)
+        _name_models(models, suite_settings, claim_settings, objects)
         suite = {
             "title": title,
             "settings": suite_settings,
@@ -257,7 +239,7 @@ def _assert_claim(
         }
         config = (
             experiment.settings(suite=title, run=None if run is None else str(run))
-            .with_python_only_parts(python_only)
+            .with_python_only_parts(_list_python_only(title, models))
             .with_python_objects(objects)
         )
         result: SuiteResult = experiment.run(config, suite=suite)
@@ -265,6 +247,58 @@ def _assert_claim(
     if claim_result.verdict != "held":
         raise AssertionError(_format_report(result, claim_result, _describe_repeat()))
     return result
+
+
+def _name_models(
+    models: Mapping[str, workbench.AnyModel],
+    suite_settings: dict[str, Any],
+    claim_settings: dict[str, Any],
+    objects: dict[tuple[str, str], Any],
+) -> None:
+    """Add the names of models to the settings, and the models to the objects.
+
+    Args:
+        models: models by setting.
+        suite_settings: settings of the suite, which gets the name of "model".
+        claim_settings: settings of the claim, which gets that of "than".
+        objects: objects by (role, name); names and files are none.
+    """
+    # late: torch takes long to import
+    from advsearch.extend import workbench
+
+    for key, model in models.items():
+        model_name = workbench.get_model_name(model)
+        if key == "model":
+            suite_settings[key] = model_name
+        else:
+            claim_settings[key] = model_name
+        if not isinstance(model, (str, Path)):
+            objects["model", model_name] = model
+
+
+def _list_python_only(
+    title: str, models: Mapping[str, workbench.AnyModel]
+) -> list[workbench.PythonOnly]:
+    """Return everything of a call that the file of its run cannot name.
+
+    The run cannot be repeated from the file: the call itself, and models of this
+    session only.
+
+    Args:
+        title: name of the called function.
+        models: its models by setting.
+    """
+    # late: torch takes long to import
+    from advsearch.extend import workbench
+
+    return [
+        workbench.PythonOnly("call", f"of {title}"),
+        *(
+            workbench.PythonOnly("model", workbench.get_model_name(model))
+            for model in models.values()
+            if workbench.is_session_only(model)
+        ),
+    ]
 
 
 def _describe_repeat() -> str:
