@@ -20,7 +20,7 @@ import keyword
 import math
 import pickletools
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -375,20 +375,33 @@ def rewrite_program(archive: Archive) -> io.BytesIO:
         # torch requires this member (example inputs), but does not need its content
         writer.write_bytes(EXAMPLE[0], b"")
         for kind in ("weights", "constants"):
-            folder = f"data/{kind}/"
-            # An archive has either one pickle of all tensors, or a table with a file
-            # for each tensor.
-            pickle_name = names[f"{folder}model.pt"]
-            if pickle_name in archive:
-                _check_pickle(archive, pickle_name)
-                writer.write_bytes(
-                    f"{folder}model.pt", archive.read_member(pickle_name)
-                )
-            else:
-                config = f"{folder}model_{kind}_config.json"
-                _copy_tensors(archive, writer, folder, config)
+            _copy_all_tensors(archive, writer, kind, names)
     buffer.seek(0)
     return buffer
+
+
+def _copy_all_tensors(
+    archive: Archive, writer: Any, kind: str, names: Mapping[str, str]
+) -> None:
+    """Copy all tensors of a kind from an archive to a new one.
+
+    An archive has either one pickle of all tensors, or a table with a file for each
+    tensor.
+
+    Args:
+        archive: archive to read.
+        writer: writer of the new archive.
+        kind: "weights" or "constants".
+        names: the names of members in the archive, by their present names.
+    """
+    folder = f"data/{kind}/"
+    pickle_name = names[f"{folder}model.pt"]
+    if pickle_name in archive:
+        _check_pickle(archive, pickle_name)
+        writer.write_bytes(f"{folder}model.pt", archive.read_member(pickle_name))
+    else:
+        config = f"{folder}model_{kind}_config.json"
+        _copy_tensors(archive, writer, folder, config)
 
 
 def _read_program(archive: Archive, name: str) -> Any:
@@ -426,6 +439,24 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
     Raises:
         FileFormatError: the table or one of its entries has another form.
     """
+    table = _read_tensor_table(archive, config)
+    copied: set[str] = set()  # multiple tensors may share a file of numbers
+    for name, entry in table.items():
+        # If this member is missing, `read_member` raises an error below.
+        member = f"{folder}{_get_record(archive, name, entry)}"
+        _check_not_empty(archive, member, entry)
+        if member not in copied:
+            writer.write_bytes(member, archive.read_member(member))
+            copied.add(member)
+    writer.write_bytes(config, json.dumps({"config": table}).encode())
+
+
+def _read_tensor_table(archive: Archive, config: str) -> Any:
+    """Return the entry of each tensor by its name, from the member `config`.
+
+    Raises:
+        FileFormatError: the table has another form, or a name is not plain.
+    """
     content = archive.read_json(config)
     table = content.get("config") if isinstance(content, dict) else None
     if not isinstance(table, dict) or not all(
@@ -436,27 +467,33 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
             f"expected a table of tensors in {config!r}, got something else",
         )
     # Names of tensors are the keys of the table: they have to be plain names.
-    table = _check_value(archive.path, table, "tensor_name")
-    copied: set[str] = set()  # multiple tensors may share a file of numbers
-    for name, entry in table.items():
-        # If this member is missing, `read_member` raises an error below.
-        member = f"{folder}{_get_record(archive, name, entry)}"
-        shape = _read_shape(archive, member, entry)
-        # For an empty file torch would allocate a tensor of any size that the table
-        # states, which could exhaust the memory.
-        if (
-            member in archive
-            and archive.members[member].file_size == 0
-            and math.prod(shape) > 0
-        ):
-            raise make_archive_error(
-                archive.path,
-                f"{member[:80]!r} is empty, but should hold a tensor of {shape[:8]}",
-            )
-        if member not in copied:
-            writer.write_bytes(member, archive.read_member(member))
-            copied.add(member)
-    writer.write_bytes(config, json.dumps({"config": table}).encode())
+    return _check_value(archive.path, table, "tensor_name")
+
+
+def _check_not_empty(archive: Archive, member: str, entry: Any) -> None:
+    """Check that the file of a tensor has numbers if the tensor has.
+
+    For an empty file torch would allocate a tensor of any size that the table states,
+    which could exhaust the memory.
+
+    Args:
+        archive: archive to read.
+        member: name of the file.
+        entry: entry of the tensor in the table.
+
+    Raises:
+        FileFormatError: the file is empty, or the entry has another form.
+    """
+    shape = _read_shape(archive, member, entry)
+    if (
+        member in archive
+        and archive.members[member].file_size == 0
+        and math.prod(shape) > 0
+    ):
+        raise make_archive_error(
+            archive.path,
+            f"{member[:80]!r} is empty, but should hold a tensor of {shape[:8]}",
+        )
 
 
 def _get_record(archive: Archive, name: str, entry: Any) -> str:
@@ -539,16 +576,28 @@ def _check_value(path: Path, value: JsonValue, key: str) -> Any:
             # The value is not used, so that it needs no check.
             checked[name] = _EMPTIED_ENTRIES[name]
             continue
-        problem = _find_problem(name, key) if name else ""  # the empty key is allowed
-        is_custom_object = name in ("as_custom_obj", "custom_obj")
-        # torch always writes this table, which is empty for a plain network.
-        has_custom_objects = name == "custom_obj_values" and bool(inner)
-        if is_custom_object or has_custom_objects:
-            problem = "holds a custom object, which is never loaded"
+        problem = _find_entry_problem(name, inner, key)
         if problem:
             raise make_archive_error(path, problem)
         checked[name] = _check_value(path, inner, name)
     return checked
+
+
+def _find_entry_problem(name: str, value: JsonValue, key: str) -> str:
+    """Return what is wrong with an entry of a mapping; "" for nothing.
+
+    Args:
+        name: name of the entry.
+        value: its value, of which only custom objects are checked.
+        key: name of the entry that holds the mapping.
+    """
+    problem = _find_problem(name, key) if name else ""  # the empty key is allowed
+    is_custom_object = name in ("as_custom_obj", "custom_obj")
+    # torch always writes this table, which is empty for a plain network.
+    has_custom_objects = name == "custom_obj_values" and bool(value)
+    if is_custom_object or has_custom_objects:
+        return "holds a custom object, which is never loaded"
+    return problem
 
 
 def _find_problem(value: Any, key: str) -> str:
