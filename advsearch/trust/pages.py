@@ -96,6 +96,24 @@ def check_request(
             "the request is from a page of another origin; open the address that was "
             "printed",
         )
+    _check_site(command, headers)
+    if token is not None and not _has_token(path, headers, port, token):
+        raise RequestRejected(
+            HTTPStatus.UNAUTHORIZED,
+            "the token is missing; open the address that was printed",
+        )
+
+
+def _check_site(command: str, headers: Message) -> None:
+    """Check that a request is not from another site, unless it follows a link.
+
+    Args:
+        command: HTTP method, such as "GET".
+        headers: headers of the request.
+
+    Raises:
+        RequestRejected: it is from another site.
+    """
     # "none" is a request of the user, such as an address that was typed. The header is
     # missing in requests of programs and old browsers.
     site = headers.get("Sec-Fetch-Site", "none")
@@ -106,11 +124,6 @@ def check_request(
     if not is_same_origin and not follows_link:
         raise RequestRejected(
             HTTPStatus.FORBIDDEN, "the request is from a page of another site"
-        )
-    if token is not None and not _has_token(path, headers, port, token):
-        raise RequestRejected(
-            HTTPStatus.UNAUTHORIZED,
-            "the token is missing; open the address that was printed",
         )
 
 
