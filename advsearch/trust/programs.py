@@ -100,14 +100,7 @@ def find_blender(who: str, otherwise: str) -> list[str]:
         program = sys.executable
     executable = shutil.which(program or "")
     if executable is None:
-        missing = "none is installed"
-        if program is not None:
-            missing = f"{BLENDER} names {program}, which can't be run"
-        raise FileFormatError(
-            f"{who}, and {missing}; install Blender so that `blender` is found, or "
-            "type `python3.11 -m venv bpy && bpy/bin/pip install bpy` and set "
-            f"{BLENDER}=bpy/bin/python; or {otherwise}"
-        )
+        raise _make_blender_error(program, who, otherwise)
     program = os.path.abspath(executable)
     is_python = Path(program).name.startswith("python")  # one with the package bpy
     if is_python:
@@ -123,3 +116,23 @@ def find_blender(who: str, otherwise: str) -> list[str]:
         "1",
         "--python",
     ]
+
+
+def _make_blender_error(
+    program: str | None, who: str, otherwise: str
+) -> FileFormatError:
+    """Return the error for a Blender that is missing or cannot be run.
+
+    Args:
+        program: the program that is no executable; None if none is installed.
+        who: beginning of the message, which states what needs Blender.
+        otherwise: end of the message, which states what else the user can do.
+    """
+    missing = "none is installed"
+    if program is not None:
+        missing = f"{BLENDER} names {program}, which can't be run"
+    return FileFormatError(
+        f"{who}, and {missing}; install Blender so that `blender` is found, or "
+        "type `python3.11 -m venv bpy && bpy/bin/pip install bpy` and set "
+        f"{BLENDER}=bpy/bin/python; or {otherwise}"
+    )
