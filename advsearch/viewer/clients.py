@@ -83,6 +83,16 @@ class _Connection:
     since: float = math.inf
     due: float = math.inf
 
+    def disconnect(self) -> None:
+        """End the connection, on which the worker's next read or write then fails."""
+        # These values make it neither slow nor overdue, so that it is not disconnected
+        # twice.
+        self.since = math.inf
+        self.due = math.inf
+        # The plain method: that of an SSL socket would forget that it is one.
+        with suppress(OSError):
+            socket.socket.shutdown(self.connection, socket.SHUT_RDWR)
+
 
 class _SilentClient(NamedTuple):
     """A client that has sent nothing yet: its address, and the time of its connection."""
@@ -134,22 +144,22 @@ class ConnectionPool:
         This thread accepts connections, and worker threads serve them.
         """
         self._ended.clear()
-
-        def work() -> None:
-            while True:
-                job = self._ready.get()
-                if job is None:  # put by `close`
-                    return
-                connection, address = job
-                self.serve_connection(connection, address)
-
         for _ in range(N_WORKERS):
-            threading.Thread(target=work, daemon=True).start()
+            threading.Thread(target=self._serve_ready, daemon=True).start()
         try:
             with selectors.DefaultSelector() as selector:
                 self._watch(selector)
         finally:
             self._ended.set()
+
+    def _serve_ready(self) -> None:
+        """Serve the connections that are ready, until the pool is closed."""
+        while True:
+            job = self._ready.get()
+            if job is None:  # put by `close`
+                return
+            connection, address = job
+            self.serve_connection(connection, address)
 
     def close(self) -> None:
         """End `serve`, and close the connections that wait for a worker."""
@@ -205,29 +215,36 @@ class ConnectionPool:
                 selector.unregister(self._listening)
             listens = has_room
             for key, _ in selector.select(CHECK_INTERVAL):
-                connection: Any = key.fileobj
-                if connection is self._listening:
-                    with suppress(OSError):  # the client may have gone
-                        connection, address = self._listening.accept()
-                        silent[connection] = _SilentClient(address, time.monotonic())
-                        selector.register(connection, selectors.EVENT_READ)
-                else:  # a silent client has sent something
-                    selector.unregister(connection)
-                    client = silent.pop(connection)
-                    self._ready.put((connection, client.address))
+                self._accept_or_pass_on(key.fileobj, silent, selector)
             now = time.monotonic()
-            # silent clients have less time if others wait
-            max_silence = REQUEST_SECONDS
-            if not has_room:
-                max_silence = min(REQUEST_SECONDS, SLOW_CLIENT_SECONDS)
-            for connection, client in list(silent.items()):
-                if now - client.since > max_silence:
-                    del silent[connection]
-                    selector.unregister(connection)
-                    connection.close()
+            _close_silent(silent, selector, now, others_wait=not has_room)
             self._end_slow_clients(now)
         for connection in silent:
             connection.close()
+
+    def _accept_or_pass_on(
+        self,
+        connection: Any,
+        silent: dict[Any, _SilentClient],
+        selector: selectors.BaseSelector,
+    ) -> None:
+        """Accept a new connection, or pass one that has sent something to the workers.
+
+        Args:
+            connection: the socket at which something has come: the one that listens, or
+                that of a silent client.
+            silent: silent clients by connection, which are changed.
+            selector: selector that waits for all sockets.
+        """
+        if connection is self._listening:
+            with suppress(OSError):  # the client may have gone
+                connection, address = self._listening.accept()
+                silent[connection] = _SilentClient(address, time.monotonic())
+                selector.register(connection, selectors.EVENT_READ)
+        else:  # a silent client has sent something
+            selector.unregister(connection)
+            client = silent.pop(connection)
+            self._ready.put((connection, client.address))
 
     def _end_slow_clients(self, now: float) -> None:
         """Disconnect clients for which a worker has waited too long.
@@ -252,14 +269,7 @@ class ConnectionPool:
             if not is_overdue and not must_make_room:
                 continue
             n_needed_workers -= 1  # its worker becomes free
-            # These values make it neither slow nor overdue, so that it is not
-            # disconnected twice.
-            client.since = math.inf
-            client.due = math.inf
-            # The worker's next read or write ends then. (The plain method: that of an SSL
-            # socket would forget that it is one.)
-            with suppress(OSError):
-                socket.socket.shutdown(client.connection, socket.SHUT_RDWR)
+            client.disconnect()
 
     def serve_connection(self, connection: socket.socket, address: Any) -> None:
         """Serve one client in this thread.
@@ -292,6 +302,31 @@ class ConnectionPool:
             with suppress(OSError):
                 # the plain method: that of an SSL socket would forget that it is one
                 socket.socket.shutdown(connection, socket.SHUT_WR)
+            connection.close()
+
+
+def _close_silent(
+    silent: dict[Any, _SilentClient],
+    selector: selectors.BaseSelector,
+    now: float,
+    *,
+    others_wait: bool,
+) -> None:
+    """Close connections that have been silent for too long.
+
+    Args:
+        silent: silent clients by connection; those that are closed are removed.
+        selector: selector that waits for them.
+        now: the present time (`time.monotonic`).
+        others_wait: whether other connections wait, so that there is less time.
+    """
+    max_silence = REQUEST_SECONDS
+    if others_wait:
+        max_silence = min(REQUEST_SECONDS, SLOW_CLIENT_SECONDS)
+    for connection, client in list(silent.items()):
+        if now - client.since > max_silence:
+            del silent[connection]
+            selector.unregister(connection)
             connection.close()
 
 
