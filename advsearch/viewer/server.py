@@ -93,21 +93,30 @@ def make_list_page(runs: Mapping[str, Path]) -> str:
     ]
     # the newest first; runs with an unknown time of their start last
     listed.sort(key=lambda item: item[1].when or 0.0, reverse=True)
+    if not listed:
+        content = make_element(
+            "p", "No runs here yet: advsearch sweep, or advsearch attack, makes one."
+        )
+    else:
+        content = _make_runs_form(listed)
+    title = make_element("header", make_element("h1", "Runs"))
+    return make_document("Runs", title, make_element("main", content), connects=True)
+
+
+def _make_runs_form(listed: Sequence[tuple[str, listing.ListedRun]]) -> Html:
+    """Return the table of runs, in which sweeps can be chosen for a comparison.
+
+    Args:
+        listed: the runs with their names.
+    """
     # a single sweep has nothing to be compared with
     can_compare = sum(run.command == "sweep" for _, run in listed) > 1
     button = None
     if can_compare:
         text = "Show the chosen sweeps side by side"
         button = make_element("p", make_element("button", text, type="submit"))
-    if not listed:
-        content = make_element(
-            "p", "No runs here yet: advsearch sweep, or advsearch attack, makes one."
-        )
-    else:
-        table = make_scrollable(_runs_table(listed, can_compare))
-        content = make_element("form", table, button, action="compare/")
-    title = make_element("header", make_element("h1", "Runs"))
-    return make_document("Runs", title, make_element("main", content), connects=True)
+    table = make_scrollable(_runs_table(listed, can_compare))
+    return make_element("form", table, button, action="compare/")
 
 
 def _runs_table(
@@ -143,22 +152,19 @@ def _run_row(name: str, run: listing.ListedRun, can_compare: bool) -> Html:
     if can_compare:
         checkbox = _comparison_checkbox(name) if run.command == "sweep" else None
         cells.append(make_element("td", checkbox))
-    cells.append(make_element("td", _cover_link(run, address)))
-    cells.append(
-        make_element(
-            "th",
-            make_element("a", name, href=address),
-            _run_subject(name, run, address),
-            scope="row",
-        )
-    )
+    link = make_element("a", name, href=address)
+    subject = _run_subject(name, run, address)
     outcome = join_html(run.state, f": {run.outcome}" if run.outcome else None)
     fault = make_element("div", run.fault, class_="remarks") if run.fault else None
-    cells.append(make_element("td", outcome, fault))
     start = ""
     if run.when is not None:
         start = time.strftime("%Y-%m-%d %H:%M", time.localtime(run.when))
-    cells.append(make_element("td", start, class_="number"))
+    cells += [
+        make_element("td", _cover_link(run, address)),
+        make_element("th", link, subject, scope="row"),
+        make_element("td", outcome, fault),
+        make_element("td", start, class_="number"),
+    ]
     return make_element("tr", *cells)
 
 
@@ -233,11 +239,6 @@ def make_progress_page(name: str, run: Path) -> str:
     """
     listed = listing.read_listed_run(run)
     subjects = (listed.command, listed.object, " and ".join(listed.controls))
-    if listed.state == "running":
-        state = "A process is working on it."
-    else:
-        state = f"It was stopped: advsearch resume {name} goes on."
-    counts = [f"{count} of {kind}" for kind, count in listed.kinds.items()]
     header = make_element(
         "header",
         make_element("p", ", ".join(filter(None, subjects)), class_="eyebrow"),
@@ -245,10 +246,9 @@ def make_progress_page(name: str, run: Path) -> str:
     )
     # The script requests rows after a row from this address, relative to the page.
     request = {"progress": "progress", "start": FIRST_ROW_ID}
-    state_text = f"{state} Evaluations so far: {', '.join(counts) or 'none'}."
     main = make_element(
         "main",
-        make_element("p", state_text, id="state"),
+        make_element("p", _describe_state(name, listed), id="state"),
         make_element("div", id="follow"),  # filled by the script follow.js
         _attack_list_html(run),
     )
@@ -261,6 +261,16 @@ def make_progress_page(name: str, run: Path) -> str:
         connects=True,
         footer=f"run {name}",
     )
+
+
+def _describe_state(name: str, run: listing.ListedRun) -> str:
+    """Return whether a run is running, and its evaluations so far, as sentences."""
+    if run.state == "running":
+        state = "A process is working on it."
+    else:
+        state = f"It was stopped: advsearch resume {name} goes on."
+    counts = [f"{count} of {kind}" for kind, count in run.kinds.items()]
+    return f"{state} Evaluations so far: {', '.join(counts) or 'none'}."
 
 
 def _attack_list_html(run: Path) -> Html | None:
@@ -303,12 +313,7 @@ def make_progress_json(run: Path, after: int) -> bytes:
             for row in islice(results.rows(after=after), MAX_PROGRESS_ROWS):
                 rows.append(_row_json(row))
                 last_id = row.id or after  # stored rows have an id
-            # Only images of the search, since the page displays no others. The index of
-            # an evaluation in its search is its step.
-            for step, picture in results.iterate_images("search", after, last_id):
-                jpeg = make_thumbnail(picture.astype("float32") / 255.0)
-                url = make_data_url(jpeg, "image/jpeg")
-                pictures.append({"step": step, "picture": url})
+            pictures = _list_search_pictures(results, after, last_id)
     progress = {
         "rows": rows,
         "pictures": pictures,
@@ -317,6 +322,25 @@ def make_progress_json(run: Path, after: int) -> bytes:
         "ended": ended,
     }
     return json.dumps(to_json_value(progress), allow_nan=False).encode()
+
+
+def _list_search_pictures(
+    results: store.Store, after: int, last_id: int
+) -> list[dict[str, object]]:
+    """Return the step and the data URL of each image of a search.
+
+    Args:
+        results: stored results of the run.
+        after: id of the row after which the images begin.
+        last_id: id of the last row.
+    """
+    pictures = list[dict[str, object]]()
+    # Only images of the search, since the page displays no others. The index of an
+    # evaluation in its search is its step.
+    for step, picture in results.iterate_images("search", after, last_id):
+        jpeg = make_thumbnail(picture.astype("float32") / 255.0)
+        pictures.append({"step": step, "picture": make_data_url(jpeg, "image/jpeg")})
+    return pictures
 
 
 def _row_json(row: store.Row) -> dict[str, object]:
@@ -461,6 +485,14 @@ class Dashboard(HTTPServer):
         super().__init__((host, port), _Handler, bind_and_activate=False)
         # `finish_request` is the method of `socketserver` that calls `_Handler`.
         self.clients = ConnectionPool(self.socket, self.finish_request, self._context)
+        self._listen(host, port)
+
+    def _listen(self, host: str, port: int) -> None:
+        """Bind the socket to an address, and listen there.
+
+        Raises:
+            InputError: the address cannot be used.
+        """
         try:
             self.server_bind()
             self.server_activate()
@@ -592,6 +624,18 @@ class _Handler(BaseHTTPRequestHandler):
             status, text = _describe_error(error)
             data = f"{text}\n".encode("utf-8", "replace")
             response = Response("text/plain; charset=utf-8", data)
+        self._send_reply(status, response, headers)
+
+    def _send_reply(
+        self, status: HTTPStatus, response: Response, headers: Mapping[str, str]
+    ) -> None:
+        """Send a response to the client; to a HEAD request without its content.
+
+        Args:
+            status: HTTP status.
+            response: content of the response.
+            headers: headers in addition to those of all responses.
+        """
         self.send_response(status)
         for name, value in {
             "Content-Type": response.media_type,
@@ -754,26 +798,13 @@ class _Handler(BaseHTTPRequestHandler):
         """Return a page of several sweeps side by side."""
         names = dict.fromkeys(query.get("run", []))  # each name once
         runs = [(name, self.server.find_run(name)) for name in names]
-        if not runs:
-            raise RequestRejected(HTTPStatus.BAD_REQUEST, "choose at least one sweep")
-        other_commands = [
-            name
-            for name, run in runs
-            if listing.read_listed_run(run, counts=False).command != "sweep"
-        ]
-        if other_commands:
-            raise RequestRejected(
-                HTTPStatus.BAD_REQUEST,
-                "only sweeps can be shown side by side; "
-                f"{', '.join(other_commands)} is none",
-            )
+        _check_comparable(runs)
         sources = [
             _make_source(name, run, f"../runs/{quote_name(name)}/")
             for name, run in runs
         ]
-        page = make_sweep_page(
-            [(run, load_sweep_result(run)) for _, run in runs], sources
-        )
+        results = [(run, load_sweep_result(run)) for _, run in runs]
+        page = make_sweep_page(results, sources)
         return _serve_page(page, home="../")  # from compare/
 
     def _serve_rows(self, query: Query, run: Path) -> Response:
@@ -819,6 +850,30 @@ class _Handler(BaseHTTPRequestHandler):
         if len(data) < int(length):
             raise RequestRejected(HTTPStatus.BAD_REQUEST, "a part of it did not come")
         return data
+
+
+def _check_comparable(runs: Sequence[tuple[str, Path]]) -> None:
+    """Check that there are runs, and that all of them are sweeps.
+
+    Args:
+        runs: the runs with their names.
+
+    Raises:
+        RequestRejected: there is none, or one is no sweep.
+    """
+    if not runs:
+        raise RequestRejected(HTTPStatus.BAD_REQUEST, "choose at least one sweep")
+    other_commands = [
+        name
+        for name, run in runs
+        if listing.read_listed_run(run, counts=False).command != "sweep"
+    ]
+    if other_commands:
+        raise RequestRejected(
+            HTTPStatus.BAD_REQUEST,
+            "only sweeps can be shown side by side; "
+            f"{', '.join(other_commands)} is none",
+        )
 
 
 def _parse_after(query: Query) -> int:
