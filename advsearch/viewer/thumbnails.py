@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from PIL import Image
@@ -174,13 +174,9 @@ class Thumbnails:
             rows: table with the "step" and the "margin" of rows.
             max_bytes: maximum size of all URLs together.
         """
-        steps = rows["step"].to_numpy()
-        margins = rows["margin"].to_numpy()
-        # rows without a margin come last
-        order = np.argsort(np.nan_to_num(margins, nan=np.inf), kind="stable")
         remaining = set(self.numbers)
         n_bytes = 0
-        for step in steps[order]:
+        for step in _sort_by_margin(rows):
             number = int(step) // self.rows_per_image
             if number not in remaining:
                 continue
@@ -192,6 +188,15 @@ class Thumbnails:
                 return
             text = base64.b64encode(data).decode("ascii")
             yield str(number), f"data:image/jpeg;base64,{text}"
+
+
+def _sort_by_margin(rows: pd.DataFrame) -> Any:
+    """Return the steps of rows, the worst margins first."""
+    steps = rows["step"].to_numpy()
+    margins = rows["margin"].to_numpy()
+    # rows without a margin come last
+    order = np.argsort(np.nan_to_num(margins, nan=np.inf), kind="stable")
+    return steps[order]
 
 
 def find_thumbnails(run: Path) -> Thumbnails | None:
