@@ -224,9 +224,8 @@ def make_printable_pieces(run: str | Path, size: float) -> list[Piece]:
             patch_size = size * _get_relative_patch_size(control, config, summary)
             pieces.append(_make_patch_piece(control, folder, patch_size))
         elif isinstance(control, TextureControl) and texture_file.is_file():
-            pieces.extend(
-                _make_texture_pieces(control, scene.description, texture_file, size)
-            )
+            description = scene.description
+            pieces += _make_texture_pieces(control, description, texture_file, size)
     if not pieces:
         raise InputError(
             f"{folder}: it has neither a texture nor a patch, so that there is nothing "
@@ -474,17 +473,31 @@ def _make_piece(
     padding = ((bleed_rows, bleed_rows), (bleed_columns, bleed_columns))
     # the edge is repeated into the bleed
     levels = np.pad(to_8bit(fine.numpy()), (*padding, (0, 0)), mode="edge")
-    mask = None
-    if inside is not None and not inside.all():
-        fine_inside = inside.repeat(subdivisions, axis=0).repeat(subdivisions, axis=1)
-        mask = np.pad(fine_inside, padding)  # the bleed is outside of the cut
     return Piece(
         name=name,
         picture=levels,
         pixel_size_mm=(fine_width, fine_height),
         bleed=(bleed_columns, bleed_rows),
-        cut_mask=mask,
+        cut_mask=_make_cut_mask(inside, subdivisions, padding),
     )
+
+
+def _make_cut_mask(
+    inside: Mask | None,
+    subdivisions: int,
+    padding: tuple[tuple[int, int], tuple[int, int]],
+) -> Mask | None:
+    """Return the part to cut out with its bleed; None for the full image.
+
+    Args:
+        inside: (h, w) bool, the part; None for the full image.
+        subdivisions: number of parts of a pixel along each axis.
+        padding: width of the bleed in these parts: above and below, left and right.
+    """
+    if inside is None or inside.all():
+        return None
+    fine_inside = inside.repeat(subdivisions, axis=0).repeat(subdivisions, axis=1)
+    return np.pad(fine_inside, padding)  # the bleed is outside of the cut
 
 
 def _subdivide_pixels(image: Float32Array, subdivisions: int) -> Tensor:
