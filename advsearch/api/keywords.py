@@ -160,16 +160,19 @@ def _document_settings(function: Function, config: type[Config]) -> Function:
         if parameter.kind is not parameter.VAR_KEYWORD
     ]
     declared_names = [parameter.name for parameter in parameters]
-    setting_lines = []
-    for name, setting in _list_further_settings(config, declared_signature):
-        parameters.append(_make_parameter(config, setting, name))
-        line = f"{name}: {setting.text}"
-        setting_lines.append(textwrap.fill(line, 110, subsequent_indent="    "))
+    further_settings = _list_further_settings(config, declared_signature)
+    parameters += [
+        _make_parameter(config, setting, name) for name, setting in further_settings
+    ]
     signature = _Signature(
         parameters, return_annotation=declared_signature.return_annotation
     )
     signature.short = declared_signature  # `help` displays this shorter one
     wrapper = _wrap_call(function, signature)
+    setting_lines = [
+        textwrap.fill(f"{name}: {setting.text}", 110, subsequent_indent="    ")
+        for name, setting in further_settings
+    ]
     wrapper.__doc__ = _make_docstring(
         function.__doc__ or "", declared_names, config.command, setting_lines
     )
@@ -429,14 +432,6 @@ def _make_docstring(
         setting_lines: a line for each setting.
     """
     summary, _, argument_text = inspect.cleandoc(text).partition("\n\nArgs:\n")
-    # Some docstrings have the sentence below already, with details of their own.
-    summary_line = " ".join(summary.split())
-    mentions_settings = "other arguments are the settings of" in summary_line
-    if not mentions_settings:
-        summary += (
-            "\n\nAll other arguments are the settings of `advsearch "
-            f"{command}`. {RUN_STORED}"
-        )
     entry_of_name = _split_argument_entries(argument_text)
     # A name without an entry of its own has one in `SHARED_ARGUMENTS`.
     argument_entries = [
@@ -444,7 +439,22 @@ def _make_docstring(
         for name in names
     ]
     arguments = textwrap.indent("\n".join([*argument_entries, *setting_lines]), "    ")
-    return f"{summary}\n\nArgs:\n{arguments}\n\nRaises:\n    {SHARED_ERRORS}"
+    return (
+        f"{_complete_summary(summary, command)}\n\nArgs:\n{arguments}\n\nRaises:\n"
+        f"    {SHARED_ERRORS}"
+    )
+
+
+def _complete_summary(summary: str, command: str) -> str:
+    """Return a docstring's beginning with a sentence about the settings of a command."""
+    # Some docstrings have the sentence below already, with details of their own.
+    summary_line = " ".join(summary.split())
+    if "other arguments are the settings of" in summary_line:
+        return summary
+    return (
+        f"{summary}\n\nAll other arguments are the settings of `advsearch "
+        f"{command}`. {RUN_STORED}"
+    )
 
 
 def _split_argument_entries(argument_text: str) -> dict[str, str]:
