@@ -273,11 +273,7 @@ def _describe_mitsuba_file(file: str, out: Path | None) -> Understood:
         "cameras": list(contents.cameras),
     }
     lines = [f"{file}: a Mitsuba scene", *_format_names(names_by_kind)]
-    if contents.objects:
-        lines.append(
-            f"One of them as the object, the rest around it: --scene {file} "
-            f"--object {contents.objects[-1]}"
-        )
+    lines += _format_object_flags(file, contents.objects)
     lines += [f"Note: {warning}" for warning in warnings]
     facts = {
         **names_by_kind,
@@ -285,6 +281,16 @@ def _describe_mitsuba_file(file: str, out: Path | None) -> Understood:
         "warnings": list(warnings),
     }
     return facts, lines
+
+
+def _format_object_flags(file: str, object_names: Sequence[str]) -> list[str]:
+    """Return a line with flags that choose a shape; no line if there are no shapes."""
+    if not object_names:
+        return []
+    return [
+        f"One of them as the object, the rest around it: --scene {file} "
+        f"--object {object_names[-1]}"
+    ]
 
 
 def _load_mitsuba_object(
