@@ -515,8 +515,7 @@ def make_case_claim(
         statement = f"{name}: an adversarial scene holds in {rate_text}."
         return make_claim("found", statement, extent)
     found_nothing = ending in FAILED_SEARCH_ENDINGS
-    was_searched = spent is not None
-    if not was_searched and (found_nothing or ending == "not verified"):
+    if spent is None and (found_nothing or ending == "not verified"):
         # Nothing follows about other scenes, so only the rate of this one is claimed.
         statement = f"{name}: the adversarial scene is not confirmed, in {rate_text}."
         return make_claim("measured", statement, extent)
