@@ -768,19 +768,24 @@ def format_twin_evidence(evidence: TwinEvidence) -> str:
             f"How far this holds for photographs was not measured: "
             f"{_TWIN_MISMATCHES[evidence.match].format(run=name)}."
         )
-    agreement = (
+    return (
         f"Photographs ({name}; {_describe_twins(row, evidence)}): this model was "
         f"right or wrong on both in {format_estimate(row.agreement)} of "
-        f"{format_count(row.pairs, 'pair')} of {format_count(row.frames, 'frame')}."
+        f"{format_count(row.pairs, 'pair')} of {format_count(row.frames, 'frame')}. "
+        f"{_format_failing_twins(row)}"
     )
+
+
+def _format_failing_twins(row: TwinAgreement) -> str:
+    """Return, in a sentence, how often a failing render was a failing photograph."""
     failing = f"{row.both_wrong} of {row.wrong_twins}"  # of the wrong renders
     if row.wrong_where_twin_wrong is None:
         return (
-            f"{agreement} Too few renders failed to state how often a failing render "
+            "Too few renders failed to state how often a failing render "
             f"is a failing photograph ({failing})."
         )
     return (
-        f"{agreement} A failing render was a failing photograph in "
+        "A failing render was a failing photograph in "
         f"{format_estimate(row.wrong_where_twin_wrong)} ({failing}); photographs failed "
         f"in {format_estimate(row.photo_wrong)} at all."
     )
