@@ -113,12 +113,10 @@ def correlation_interval(
     if n_units < MIN_UNITS:
         return None
     # the coefficient without the rows of one unit, for each unit
-    values_without_unit = np.array(
-        [
-            statistic(first[unit_index != unit], second[unit_index != unit])
-            for unit in range(n_units)
-        ]
-    )
+    values_without_unit = np.empty(n_units)
+    for unit in range(n_units):
+        is_other = unit_index != unit
+        values_without_unit[unit] = statistic(first[is_other], second[is_other])
     value = statistic(first, second)
     if not math.isfinite(value) or not np.isfinite(values_without_unit).all():
         return None
