@@ -766,7 +766,11 @@ def _check_pickle(archive: Archive, name: str) -> None:
         steps = list(pickletools.genops(inner.read_member("data.pkl", LARGEST_TEXT)))
     except (ValueError, IndexError, UnicodeDecodeError):
         raise refusal from None
-    for step, argument, _position in steps:
-        imports_other = step.name == "GLOBAL" and not _GLOBALS.fullmatch(str(argument))
-        if imports_other or step.name in _OTHER_IMPORTS:
-            raise refusal
+    if any(_imports_other(step.name, argument) for step, argument, _position in steps):
+        raise refusal
+
+
+def _imports_other(step_name: str, argument: Any) -> bool:
+    """Return whether a step of a pickle imports anything but the classes of tensors."""
+    is_other_class = step_name == "GLOBAL" and not _GLOBALS.fullmatch(str(argument))
+    return is_other_class or step_name in _OTHER_IMPORTS
