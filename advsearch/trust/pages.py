@@ -89,18 +89,31 @@ def check_request(
             HTTPStatus.FORBIDDEN,
             "this is not the address of the server; open the address that it printed",
         )
-    origin = headers.get("Origin")
-    if origin is not None and origin != f"{scheme}://{host}":
-        raise RequestRejected(
-            HTTPStatus.FORBIDDEN,
-            "the request is from a page of another origin; open the address that was "
-            "printed",
-        )
+    _check_origin(headers, f"{scheme}://{host}")
     _check_site(command, headers)
     if token is not None and not _has_token(path, headers, port, token):
         raise RequestRejected(
             HTTPStatus.UNAUTHORIZED,
             "the token is missing; open the address that was printed",
+        )
+
+
+def _check_origin(headers: Message, server_origin: str) -> None:
+    """Check that a request is not from a page of another origin.
+
+    Args:
+        headers: headers of the request.
+        server_origin: the origin of our pages, such as "http://localhost:8265".
+
+    Raises:
+        RequestRejected: it is from such a page.
+    """
+    origin = headers.get("Origin")
+    if origin is not None and origin != server_origin:
+        raise RequestRejected(
+            HTTPStatus.FORBIDDEN,
+            "the request is from a page of another origin; open the address that was "
+            "printed",
         )
 
 
