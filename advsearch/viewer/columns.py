@@ -212,7 +212,6 @@ def pack_columns(
     # The columns with the largest values first. `itemsize` is the bytes of one value,
     # also in a column with several values for each row.
     arrays = sorted(columns.items(), key=lambda item: -item[1].itemsize)
-    boxes: Boxes | None = rows.attrs.get(BOXES_ATTRIBUTE)
     head = {
         "count": len(rows),
         "last": int(rows["id"].iloc[-1]) if len(rows) else 0,
@@ -221,13 +220,19 @@ def pack_columns(
         "answers": labels,
         "outcomes": outcome_names,
         "parameters": parameters,
-        "things": list(boxes.names) if boxes is not None else [],
+        "things": _list_thing_names(rows),
         "columns": _make_layout(arrays),
     }
     data = [
         values.astype(values.dtype.newbyteorder("<")).tobytes() for _, values in arrays
     ]
     return b"".join([*_encode_head(head), *data])
+
+
+def _list_thing_names(rows: pd.DataFrame) -> list[str]:
+    """Return the names of the objects with boxes; an empty list without boxes."""
+    boxes: Boxes | None = rows.attrs.get(BOXES_ATTRIBUTE)
+    return list(boxes.names) if boxes is not None else []
 
 
 def _encode_head(head: Mapping[str, object]) -> tuple[bytes, bytes]:
