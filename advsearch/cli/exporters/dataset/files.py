@@ -184,10 +184,8 @@ def _write_files(
         things = categories.find_things(image)
         _write_dataset_image(folder, image)
         images.append(make_image(image_id, image))
-        next_annotation_id = len(annotations) + 1
-        annotations += make_things(next_annotation_id, image_id, things)
-        if not image.is_reproduced:
-            n_changed += 1
+        annotations += make_things(len(annotations) + 1, image_id, things)
+        n_changed += int(not image.is_reproduced)
         if format == "yolo":
             _write_yolo_labels(folder, image, things)
     if images and format == "yolo":
