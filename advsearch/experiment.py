@@ -462,21 +462,20 @@ class Experiment(Generic[AnyResult]):
         # only Python callers need it; imports torch
         from advsearch.api.keywords import make_config
 
-        # Objects that settings cannot hold are passed directly to the experiment's
-        # function. A positional setting may be such an object; its name is still stored
-        # in the settings, so it is passed to both.
-        arguments = {name: values[name] for name in object_names if name in values}
         config_values = {
             name: value
             for name, value in values.items()
             if name not in object_names or name in self.positional_args
         }
         config = make_config(self.settings, **config_values)
-        resumed = find_stopped_run(config) if resume else None
+        # Objects that settings cannot hold are passed directly to the experiment's
+        # function. A positional setting may be such an object; its name is still stored
+        # in the settings, so it is passed to both.
+        arguments = {name: values[name] for name in object_names if name in values}
         return self.run(
             config,
             progress=as_progress(progress),
-            resumed_directory=resumed,
+            resumed_directory=find_stopped_run(config) if resume else None,
             **arguments,
         )
 
