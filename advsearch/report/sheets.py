@@ -155,12 +155,7 @@ def write_sheets(
         InputError: there is no such paper, or more sheets would be needed.
         FileFormatError: the profile is not that of an RGB printer.
     """
-    if paper not in PAPERS:
-        raise InputError(f"paper: expected one of {', '.join(PAPERS)}, got {paper!r}")
-    if not 1 <= max_sheets <= MAX_SHEETS:
-        raise InputError(
-            f"sheets: expected a whole number from 1 to {MAX_SHEETS}, got {max_sheets}"
-        )
+    _check_sheet_arguments(paper, max_sheets)
     convert = None if profile is None else _load_color_conversion(profile)
     pages = list(arrange_pages(pieces, PAPERS[paper]))
     _check_sheet_count(len(pages), max_sheets, paper)
@@ -174,6 +169,20 @@ def write_sheets(
     n_cover_pages = 1
     n_last_pages = 0 if make_last_page is None else 1
     return n_cover_pages + len(pages) + n_last_pages
+
+
+def _check_sheet_arguments(paper: str, max_sheets: int) -> None:
+    """Check the name of the paper and the maximum number of sheets.
+
+    Raises:
+        InputError: there is no such paper, or the number is out of range.
+    """
+    if paper not in PAPERS:
+        raise InputError(f"paper: expected one of {', '.join(PAPERS)}, got {paper!r}")
+    if not 1 <= max_sheets <= MAX_SHEETS:
+        raise InputError(
+            f"sheets: expected a whole number from 1 to {MAX_SHEETS}, got {max_sheets}"
+        )
 
 
 def _check_sheet_count(n_sheets: int, max_sheets: int, paper: str) -> None:
