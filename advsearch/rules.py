@@ -109,13 +109,10 @@ def make_table(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
     columns = dict[str, pd.Series]()
     units = dict[str, str]()
     for name in names:
-        column = rows[name]
-        has_names = column.dtype == "category"
-        if has_names:
-            # alphabetical, so that the order of the rows does not change the result
-            column = column.cat.set_categories(sorted(column.unique()))
+        column = _sort_categories(rows[name])
         if column.nunique() > 1 and not column.isna().any():
             columns[name] = column
+            has_names = column.dtype == "category"
             units[name] = "" if has_names else rows.attrs["units"][name]
     if "outcome" in rows:
         # If a factor has the name "outcome", its column stays.
@@ -127,6 +124,16 @@ def make_table(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
     )
     table.attrs["units"] = units
     return table
+
+
+def _sort_categories(column: pd.Series) -> pd.Series:
+    """Return a column of names with these in alphabetical order; others unchanged.
+
+    So the order of the rows does not change a result.
+    """
+    if column.dtype != "category":
+        return column
+    return column.cat.set_categories(sorted(column.unique()))
 
 
 def is_in_view(rows: pd.DataFrame) -> Mask:
