@@ -108,20 +108,24 @@ def _part_content(run: Path, part: ResultPart, description: str) -> Html:
         content += [make_element("p", text) for text in part.text if text]
         alt = " ".join(part.text) or part.title
         content.append(_embed_figure(run, part.figure, alt))
-    if part.rows and part.column_heads:
-        links = document.link_parts(run, part.parts)
-        content.append(
-            document.make_table(
-                part.column_heads, part.rows, links, part.cell_fractions, part.bars
-            )
-        )
-    elif part.rows:  # without heads, the rows are pairs of a name and a value
-        content.append(document.facts_table({row[0]: row[1] for row in part.rows}))
+    content.append(_make_part_table(run, part))
     for group in part.pictures:
         content.append(_embed_images(run, group, part.layout))
     if part.note:
         content.append(make_element("p", part.note, class_="soft"))
     return join_html(*content)
+
+
+def _make_part_table(run: Path, part: ResultPart) -> Html | None:
+    """Return the table of a part; None if it has no rows."""
+    if not part.rows:
+        return None
+    if not part.column_heads:  # the rows are pairs of a name and a value
+        return document.facts_table({row[0]: row[1] for row in part.rows})
+    links = document.link_parts(run, part.parts)
+    return document.make_table(
+        part.column_heads, part.rows, links, part.cell_fractions, part.bars
+    )
 
 
 def _make_charts(
@@ -225,17 +229,28 @@ def make_page_end(run: Path, result: Result, view: ShownResult) -> Html:
         resume = shlex.join(["advsearch", "resume", str(run)])
         content += _make_command("Go on", resume)
     config_file = run / CONFIG
+    content += _explain_repeat(result, config_file)
+    if config_file.is_file():
+        content += _make_settings_html(config_file)
+    return join_html(*content)
+
+
+def _explain_repeat(result: Result, config_file: Path) -> list[Html]:
+    """Return the command that repeats a run, or why there is none.
+
+    Args:
+        result: result of the run.
+        config_file: file with its settings, which may be missing.
+    """
     # parts that exist only in a Python session, so that no file can name them
     python_only = getattr(result, "python_only", [])
     if python_only:
         repeat = f"No command repeats this: {format_python_only(python_only)}"
-        content += _make_command("Do it again", repeat)
-    elif config_file.is_file():
-        repeat = shlex.join(["advsearch", "run", str(config_file)])
-        content += _make_command("Do it again", repeat)
+        return _make_command("Do it again", repeat)
     if config_file.is_file():
-        content += _make_settings_html(config_file)
-    return join_html(*content)
+        repeat = shlex.join(["advsearch", "run", str(config_file)])
+        return _make_command("Do it again", repeat)
+    return []
 
 
 def _make_settings_html(config_file: Path) -> list[Html]:
