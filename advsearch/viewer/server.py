@@ -305,15 +305,7 @@ def make_progress_json(run: Path, after: int) -> bytes:
     # running, so that the page requests its last rows once more.
     running = is_held(run)  # a process works on it
     ended = not is_unfinished(run)  # it has its final page
-    last_id = after
-    rows = list[dict[str, object]]()
-    pictures = list[dict[str, object]]()
-    if (run / store.NAME).is_file():
-        with store.Store(run / store.NAME, read_only=True) as results:
-            for row in islice(results.rows(after=after), MAX_PROGRESS_ROWS):
-                rows.append(_row_json(row))
-                last_id = row.id or after  # stored rows have an id
-            pictures = _list_search_pictures(results, after, last_id)
+    rows, pictures, last_id = _read_new_rows(run, after)
     progress = {
         "rows": rows,
         "pictures": pictures,
@@ -322,6 +314,27 @@ def make_progress_json(run: Path, after: int) -> bytes:
         "ended": ended,
     }
     return json.dumps(to_json_value(progress), allow_nan=False).encode()
+
+
+def _read_new_rows(
+    run: Path, after: int
+) -> tuple[list[dict[str, object]], list[dict[str, object]], int]:
+    """Return new rows of a run and new images of its search, and the id of the last row.
+
+    Args:
+        run: directory of the run.
+        after: id of the row after which to begin.
+    """
+    if not (run / store.NAME).is_file():
+        return [], [], after
+    last_id = after
+    rows = list[dict[str, object]]()
+    with store.Store(run / store.NAME, read_only=True) as results:
+        for row in islice(results.rows(after=after), MAX_PROGRESS_ROWS):
+            rows.append(_row_json(row))
+            last_id = row.id or after  # stored rows have an id
+        pictures = _list_search_pictures(results, after, last_id)
+    return rows, pictures, last_id
 
 
 def _list_search_pictures(
