@@ -698,12 +698,7 @@ def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputEr
     # the flags of the command, as its help writes them
     known = re.findall(r"(?<!\S)--[a-z][a-z-]*", parser.format_help())
     if not name.startswith("--"):
-        hint = ""
-        if "--object" in known:
-            hint = f"; for the object write --object {argument}"
-        return InputError(
-            f"expected flags, got {argument!r}{hint}; see {parser.prog} --help"
-        )
+        return _make_no_flag_error(argument, parser.prog, known)
     commands_with_flag = _find_commands_with_flag(name)
     if commands_with_flag:
         return InputError(
@@ -715,6 +710,22 @@ def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputEr
         return InputError(f"{parser.prog} has no {name}{advice}")
     # a flag with a similar spelling is suggested
     return UnknownNameError("flag", name, set(known))
+
+
+def _make_no_flag_error(
+    argument: str, program: str, known: Sequence[str]
+) -> InputError:
+    """Return the error for a word without dashes where a flag is expected.
+
+    Args:
+        argument: the word.
+        program: the command, such as "advsearch attack".
+        known: its flags.
+    """
+    hint = ""
+    if "--object" in known:
+        hint = f"; for the object write --object {argument}"
+    return InputError(f"expected flags, got {argument!r}{hint}; see {program} --help")
 
 
 def _find_commands_with_flag(flag: str) -> list[str]:
