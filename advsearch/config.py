@@ -87,7 +87,7 @@ def parse_joined_names(value: Any, setting: str, default_name: str) -> Any:
     has_several_names = isinstance(entries, (list, tuple)) and len(entries) > 1
     if not has_several_names:
         return parse_name_with_options(value, setting, default_name)
-    names = []
+    names: list[str] = []
     options: dict[str, dict[str, Any]] = {}
     for entry in entries:
         name, entry_options = _parse_joined_entry(entry, setting, default_name)
@@ -97,9 +97,8 @@ def parse_joined_names(value: Any, setting: str, default_name: str) -> Any:
         if entry_options:
             options[name] = entry_options
     joined_options = _distribute_last_options(names, options)
-    return parse_name_with_options(
-        {**joined_options, "name": TASK_SEPARATOR.join(names)}, setting, default_name
-    )
+    joined: dict[str, Any] = {**joined_options, "name": TASK_SEPARATOR.join(names)}
+    return parse_name_with_options(joined, setting, default_name)
 
 
 def _parse_joined_entry(
