@@ -124,6 +124,15 @@ def distribution_to_setting(value: object) -> object:
     _check_real_numbers(family, kind)
     if is_frozen and _is_family_of_scipy(family):
         return _frozen_to_setting(value)
+    return _inverse_cdf_to_setting(value)
+
+
+def _inverse_cdf_to_setting(value: object) -> object:
+    """Return an object with an inverse CDF, or such a function, as a setting.
+
+    Any other value is returned unchanged.
+    """
+    kind = type(value)
     inverse_cdf = getattr(value, "icdf", None) or getattr(value, "ppf", None)
     if inverse_cdf and kind.__module__.startswith("torch"):
         return PythonQuantiles(kind.__name__, partial(_evaluate_in_torch, inverse_cdf))
