@@ -38,7 +38,7 @@ from advsearch.scene.assembly import IMAGE_INPUTS, pose_mesh
 from advsearch.scene.assets import Float32Array, Float64Array, IntArray, Mesh, Shape
 from advsearch.scene.description import NO_ENVIRONMENT, OBJECT, SceneDescription
 from advsearch.scene.parts import MeshPart
-from advsearch.scene.raster import compute_doubled_areas, rasterize_charts
+from advsearch.scene.raster import Charts, compute_doubled_areas, rasterize_charts
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,10 +70,7 @@ class AdversarialRun:
         folder = find_run(run)
         summary = load_attack_summary(folder)
         if summary.adversarial is None:
-            raise InputError(
-                f"{folder}: ended with {summary.ending!r}, so that there is no "
-                "adversarial configuration to export"
-            )
+            raise _make_no_scene_error(folder, summary.ending)
         # A policy or an objective may exist only in the Python session of the run, and
         # is not needed here.
         config = with_evaluation_only(AttackConfig.from_yaml(folder / CONFIG))
@@ -197,6 +194,19 @@ def _load_object_scene(config: AttackConfig) -> Scene:
     )
 
 
+def _make_no_scene_error(folder: Path, ending: str) -> InputError:
+    """Return the error for a run that found no adversarial scene.
+
+    Args:
+        folder: folder of the run.
+        ending: status with which the run ended.
+    """
+    return InputError(
+        f"{folder}: ended with {ending!r}, so that there is no adversarial "
+        "configuration to export"
+    )
+
+
 def make_printable_pieces(run: str | Path, size: float) -> list[Piece]:
     """Return the printable pieces of the adversarial scene of a run of `attack`.
 
@@ -226,11 +236,7 @@ def make_printable_pieces(run: str | Path, size: float) -> list[Piece]:
         elif isinstance(control, TextureControl) and texture_file.is_file():
             description = scene.description
             pieces += _make_texture_pieces(control, description, texture_file, size)
-    if not pieces:
-        raise InputError(
-            f"{folder}: it has neither a texture nor a patch, so that there is nothing "
-            "to print"
-        )
+    _check_any_pieces(folder, pieces)
     return pieces
 
 
@@ -244,6 +250,19 @@ def _check_printed_size(size: float) -> None:
         raise InputError(
             "size: expected the object's longest side in millimetres, 1 "
             f"to {MAX_OBJECT_SIZE:.0f}, got {size}"
+        )
+
+
+def _check_any_pieces(folder: Path, pieces: list[Piece]) -> None:
+    """Check that a run has at least one piece to print.
+
+    Raises:
+        InputError: it has none.
+    """
+    if not pieces:
+        raise InputError(
+            f"{folder}: it has neither a texture nor a patch, so that there is nothing "
+            "to print"
         )
 
 
@@ -343,10 +362,7 @@ def _find_charts(
     uv_areas = compute_doubled_areas(mesh.uvs[mesh.faces].astype(np.float64))
     raster = rasterize_charts(mesh, (texture.shape[0], texture.shape[1]))
     positions = raster.compute_positions().astype(np.float64)
-    is_printed = raster.is_covered
-    if faces is not None:
-        is_printed = is_printed & np.isin(raster.face_index, faces)
-    charts = _label_charts(is_printed)
+    charts = _label_charts(_find_printed_texels(raster, faces))
     for number, (box, inside) in enumerate(charts, 1):
         size_and_distortion = _measure_texel_size(positions[box] * scale, inside)
         if size_and_distortion is None:  # a line or a point, which cannot be printed
@@ -354,13 +370,27 @@ def _find_charts(
         texel_size, distortion = size_and_distortion
         image = _extend_inside(texture[box], inside)
         # A chart whose texture coordinates are mirrored has a negative signed area.
-        is_mirrored = uv_areas[np.unique(raster.face_index[box][inside])].sum() < 0.0
+        chart_faces = np.unique(raster.face_index[box][inside])
+        is_mirrored = uv_areas[chart_faces].sum() < 0.0
         if is_mirrored:  # mirror it back; the size of its texels stays the same
             image = image[:, ::-1]
             inside = inside[:, ::-1]
-        title = name if len(charts) == 1 else f"{name}, piece {number}"
-        title += _describe_distortion(distortion)
+        chart_name = name if len(charts) == 1 else f"{name}, piece {number}"
+        title = chart_name + _describe_distortion(distortion)
         yield _make_piece(title, image, texel_size, inside)
+
+
+def _find_printed_texels(raster: Charts, faces: IntArray | None) -> Mask:
+    """Return which texels (h, w) of a texture are printed.
+
+    Args:
+        raster: the face that each texel belongs to.
+        faces: indices of the faces to print; None for all.
+    """
+    if faces is None:
+        return raster.is_covered
+    is_printed: Mask = raster.is_covered & np.isin(raster.face_index, faces)
+    return is_printed
 
 
 def _describe_distortion(distortion: float) -> str:

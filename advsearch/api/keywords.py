@@ -14,6 +14,7 @@ import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass, field
 from functools import wraps
 from pathlib import Path
 from typing import Any, Literal, TypedDict, TypeVar
@@ -154,30 +155,43 @@ def _document_settings(function: Function, config: type[Config]) -> Function:
         config: class with the settings.
     """
     declared_signature = inspect.signature(function)
-    parameters = [
-        parameter
-        for parameter in declared_signature.parameters.values()
-        if parameter.kind is not parameter.VAR_KEYWORD
-    ]
-    declared_names = [parameter.name for parameter in parameters]
+    declared_parameters = _list_named_parameters(declared_signature)
+    declared_names = [parameter.name for parameter in declared_parameters]
     further_settings = _list_further_settings(config, declared_signature)
-    parameters += [
+    setting_parameters = [
         _make_parameter(config, setting, name) for name, setting in further_settings
     ]
     signature = _Signature(
-        parameters, return_annotation=declared_signature.return_annotation
+        [*declared_parameters, *setting_parameters],
+        return_annotation=declared_signature.return_annotation,
     )
     signature.short = declared_signature  # `help` displays this shorter one
     wrapper = _wrap_call(function, signature)
-    setting_lines = [
-        textwrap.fill(f"{name}: {setting.text}", 110, subsequent_indent="    ")
-        for name, setting in further_settings
-    ]
     wrapper.__doc__ = _make_docstring(
-        function.__doc__ or "", declared_names, config.command, setting_lines
+        function.__doc__ or "",
+        declared_names,
+        config.command,
+        _format_setting_lines(further_settings),
     )
     wrapper.__signature__ = signature  # type: ignore[attr-defined]
     return wrapper
+
+
+def _list_named_parameters(signature: inspect.Signature) -> list[inspect.Parameter]:
+    """Return the parameters of a signature without `**settings`."""
+    return [
+        parameter
+        for parameter in signature.parameters.values()
+        if parameter.kind is not parameter.VAR_KEYWORD
+    ]
+
+
+def _format_setting_lines(named_settings: Sequence[tuple[str, Setting]]) -> list[str]:
+    """Return an entry for each setting, "NAME: text", for a docstring."""
+    return [
+        textwrap.fill(f"{name}: {setting.text}", 110, subsequent_indent="    ")
+        for name, setting in named_settings
+    ]
 
 
 def _list_further_settings(
@@ -481,33 +495,80 @@ def make_config(config: type[ConfigType], **keywords: Any) -> ConfigType:
         InputError: a setting is wrong, or contradicts an object.
     """
     settings = {name: value for name, value in keywords.items() if value is not None}
-    objects: dict[tuple[str, str], Any] = {}
-    python_only: list[PythonOnly] = []
-
-    scene = settings.get("object")
-    model = settings.get("model")
-    # Workers are other processes, to which these objects cannot be sent.
-    if isinstance(scene, loading.Scene) or isinstance(model, (Model, nn.Module)):
-        check_no_worker_settings(settings)
-    if isinstance(model, (Model, nn.Module)):
-        settings["model"] = get_model_name(model)
-        objects[MODEL, settings["model"]] = model
-        if is_session_only(model):
-            python_only.append(PythonOnly("model", settings["model"]))
-    if isinstance(scene, loading.Scene):
-        _replace_scene_object(settings, scene)
-        objects[SCENE, settings["object"]] = scene
-        if scene.is_session_only:
-            python_only.append(PythonOnly("scene"))
+    _check_no_workers_for_objects(settings)
+    replaced = _ReplacedObjects()
+    replaced.replace_model(settings)
+    replaced.replace_scene(settings)
     for name in ("controls", "over"):
-        instances = _replace_control_objects(settings, name)
-        objects |= {(CONTROL, control.name): control for control in instances}
-        python_only += _list_session_only_parts(instances)
+        replaced.replace_controls(settings, name)
     return (
         config(**settings)
-        .with_python_objects(objects)
-        .with_python_only_parts(python_only)
+        .with_python_objects(replaced.objects)
+        .with_python_only_parts(replaced.python_only)
     )
+
+
+def _check_no_workers_for_objects(settings: Mapping[str, Any]) -> None:
+    """Check that there are no settings of workers if the scene or the model is an
+    object.
+
+    Workers are other processes, to which these objects cannot be sent.
+
+    Raises:
+        InputError: there are such settings.
+    """
+    has_scene = isinstance(settings.get("object"), loading.Scene)
+    if has_scene or isinstance(settings.get("model"), (Model, nn.Module)):
+        check_no_worker_settings(settings)
+
+
+@dataclass
+class _ReplacedObjects:
+    """Python objects that were settings, and were replaced by their names.
+
+    Attributes:
+        objects: the objects by kind, such as `MODEL`, and name.
+        python_only: those that only this Python session has.
+    """
+
+    objects: dict[tuple[str, str], Any] = field(default_factory=dict)
+    python_only: list[PythonOnly] = field(default_factory=list)
+
+    def replace_model(self, settings: dict[str, Any]) -> None:
+        """Replace a model that is an object by its name; settings change in place."""
+        model = settings.get("model")
+        if not isinstance(model, (Model, nn.Module)):
+            return
+        name = get_model_name(model)
+        settings["model"] = name
+        self.objects[MODEL, name] = model
+        if is_session_only(model):
+            self.python_only.append(PythonOnly("model", name))
+
+    def replace_scene(self, settings: dict[str, Any]) -> None:
+        """Replace a scene that is an object by its settings, which change in place.
+
+        Raises:
+            InputError: there are settings of loading, too, which come too late.
+        """
+        scene = settings.get("object")
+        if not isinstance(scene, loading.Scene):
+            return
+        _replace_scene_object(settings, scene)
+        self.objects[SCENE, settings["object"]] = scene
+        if scene.is_session_only:
+            self.python_only.append(PythonOnly("scene"))
+
+    def replace_controls(self, settings: dict[str, Any], name: str) -> None:
+        """Replace controls that are objects by their names and options.
+
+        Args:
+            settings: settings by name, which are changed in place.
+            name: name of the setting, "controls" or "over".
+        """
+        instances = _replace_control_objects(settings, name)
+        self.objects |= {(CONTROL, control.name): control for control in instances}
+        self.python_only += _list_session_only_parts(instances)
 
 
 def _replace_scene_object(settings: dict[str, Any], scene: loading.Scene) -> None:

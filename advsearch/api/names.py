@@ -120,11 +120,7 @@ def _check_scene(values: Mapping[str, Any]) -> None:
     """
     things = _split_things(values)
     thing_objects = [thing.partition("@")[0].strip() for thing in things]
-    objects = [
-        *split_names(values.get("object") or ""),
-        *split_names(values.get("held_out") or ""),
-        *thing_objects,
-    ]
+    objects = [*_list_main_objects(values), *thing_objects]
     known_objects = [name for name in objects if name != "all"]
     _check_words("object", known_objects, list_objects(), OBJECT_HINT)
     _check_environments(values)
@@ -132,6 +128,16 @@ def _check_scene(values: Mapping[str, Any]) -> None:
     # A scene in a file may have further objects, whose names are not known here.
     if things and judge and objects[0] in list_objects():
         _check_judge(judge, things, thing_objects)
+
+
+def _list_main_objects(values: Mapping[str, Any]) -> list[str]:
+    """Return the objects in settings, without additional ones: first those of the
+    search, then those that are held out.
+    """
+    return [
+        *split_names(values.get("object") or ""),
+        *split_names(values.get("held_out") or ""),
+    ]
 
 
 def _split_things(values: Mapping[str, Any]) -> list[str]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict
@@ -192,8 +192,7 @@ def render_picture_file(
     # an .exr file cannot show several views
     out = check_image_path(config.out, n_views=config.around or 1)
     aovs = parse_aovs(config.aov)
-    if aovs and config.around is not None:
-        raise InputError("aov: is of one view; leave `around` out")
+    _check_single_view_of_aovs(config, aovs)
     _check_replaces_no_input(config, out)
     rendering, model_warnings = _render_configuration(
         config, with_aovs=bool(aovs), progress=progress
@@ -206,6 +205,20 @@ def render_picture_file(
     image_size = rendering.save(out)
     prediction_path = rendering.save_predictions(out)
     return rendering.result(out, image_size, warnings, prediction_path)
+
+
+def _check_single_view_of_aovs(config: RenderConfig, aovs: Collection[str]) -> None:
+    """Check that layers of ground truth are rendered for a single view only.
+
+    Args:
+        config: settings of the image.
+        aovs: names of the layers.
+
+    Raises:
+        InputError: there are layers, and several views.
+    """
+    if aovs and config.around is not None:
+        raise InputError("aov: is of one view; leave `around` out")
 
 
 def _render_configuration(

@@ -118,13 +118,22 @@ def _render_run(folder: Path, every: bool, progress: Progress) -> Iterator[Rende
                 yield replace(rendered, name=f"{part.name}-{rendered.name}")
         return
     command = str(read_yaml(folder / CONFIG).get("command"))
+    _check_renderable_command(folder, command)
+    _check_renderable_parts(folder)
+    yield from RENDERERS[command](folder, every, progress)
+
+
+def _check_renderable_command(folder: Path, command: str) -> None:
+    """Check that the images of a run's command can be rendered again.
+
+    Raises:
+        InputError: they cannot.
+    """
     if command not in RENDERERS:
         raise InputError(
             f"{folder}: expected a run of {' or '.join(RENDERERS)}, or one with such "
             f"parts, got one of {command}"
         )
-    _check_renderable_parts(folder)
-    yield from RENDERERS[command](folder, every, progress)
 
 
 def _check_renderable_parts(folder: Path) -> None:
@@ -164,18 +173,30 @@ def _render_sweep(
     scenes = load_scenes_of_sweep(config.model_copy(update={"metrics": {}}))
     job = scenes.job
     rows_of_image = _read_sweep_rows(folder, len(job.models))
-    # An image that was not judged (`correct` is None) counts as wrong.
-    images = sorted(
-        image
-        for image, rows in rows_of_image.items()
-        if every or not all(row.correct for row in rows)
-    )
+    images = _select_sweep_images(rows_of_image, every)
     _check_image_indices(folder, images, job.images_per_scene * len(job.scenes))
     progress.stage("rendering pictures", len(images))
     for image in images:
         rows = sorted(rows_of_image[image], key=lambda row: row.step)
         yield _render_sweep_image(scenes, image, rows)
         progress.advance(1)
+
+
+def _select_sweep_images(
+    rows_of_image: Mapping[int, Sequence[Row]], every: bool
+) -> list[int]:
+    """Return the sorted indices of the images to render.
+
+    Args:
+        rows_of_image: rows of the sweep by the index of their image.
+        every: whether to select all images; otherwise only those about which a model is
+            wrong. An image that was not judged (`correct` is None) counts as wrong.
+    """
+    return sorted(
+        image
+        for image, rows in rows_of_image.items()
+        if every or not all(row.correct for row in rows)
+    )
 
 
 def _check_image_indices(folder: Path, images: Sequence[int], n_images: int) -> None:
@@ -266,12 +287,11 @@ def _render_attack(
     parts = load_parts_of_run(folder)
     problem, _ = make_problem_with_warnings(parts)
     configuration_of_kind = _read_trial_configurations(folder, summary, problem)
+    # without conditions, trials of a scene differ in noise only
+    max_trials = None if problem.conditions else 1
     rows = list[Row]()
     for kind in configuration_of_kind:
-        trials = _read_trials(folder, kind, every)
-        if not problem.conditions:
-            trials = trials[:1]  # they differ in noise only
-        rows += trials
+        rows += _read_trials(folder, kind, every)[:max_trials]
     progress.stage("rendering pictures", len(rows))
     for row in rows:
         yield _render_trial(parts, problem, row, configuration_of_kind[row.kind])
