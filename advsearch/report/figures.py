@@ -130,9 +130,19 @@ def draw_fractions(
             for row, row_fractions in enumerate(rows.values())
         ]
         _draw_series(axes, fractions, label, colour, mark)
-    axes.set_yticks(range(len(rows)), list(rows))
+    _set_row_axes(axes, list(rows))
+
+
+def _set_row_axes(axes: Any, labels: Sequence[str]) -> None:
+    """Set axes for fractions in [0, 1] on rows that are 1 apart, from the top.
+
+    Args:
+        axes: axes of matplotlib.
+        labels: label of each row.
+    """
+    axes.set_yticks(range(len(labels)), labels)
     # upside down: the first row is at the top
-    axes.set(xlim=(-0.03, 1.03), ylim=(len(rows) - 0.4, -0.6))
+    axes.set(xlim=(-0.03, 1.03), ylim=(len(labels) - 0.4, -0.6))
     axes.grid(True, axis="x")
 
 
@@ -190,12 +200,9 @@ def draw_searches(
         _draw_search(axes, name, values, colour, dashes)
     if zero_means:
         _draw_zero_line(axes, zero_means)
-    axes.set(
-        xlabel="evaluations",
-        ylabel=meaning,
-        # up to 2 at least: an axis for a single evaluation would have no width
-        xlim=(1, max(2, *map(len, objectives.values()))),
-    )
+    # up to 2 at least: an axis for a single evaluation would have no width
+    last_evaluation = max(2, *map(len, objectives.values()))
+    axes.set(xlabel="evaluations", ylabel=meaning, xlim=(1, last_evaluation))
     axes.locator_params("x", integer=True)
     axes.grid(True, axis="y")
     axes.legend()
@@ -233,16 +240,7 @@ def _draw_search(
         best_so_far = np.fmax.accumulate(objective)  # `fmax` ignores NaN
     # of a long search only some points are drawn
     indices = _select_points(len(objective))
-    # Each dot is drawn as a line of length 0 with round ends. So all dots are a single
-    # path in the SVG, which keeps the page small.
-    axes.plot(
-        _as_dots(indices + 1.0),
-        _as_dots(objective[indices]),
-        solid_capstyle="round",
-        linewidth=4,
-        alpha=0.35,
-        color=colour,
-    )
+    _draw_evaluation_dots(axes, indices + 1.0, objective[indices], colour)
     axes.plot(
         indices + 1,
         best_so_far[indices],
@@ -271,6 +269,30 @@ MARGIN = "margin [logits]; below 0: wrong"
 ACCURACY = "accuracy"
 """The quantities of the colors of a map. In both, red means wrong."""
 MAX_POINTS = 400  # maximum number of points that are drawn of a search
+
+
+def _draw_evaluation_dots(
+    axes: Any, numbers: Any, objectives: Any, colour: str
+) -> None:
+    """Draw a faint dot for each evaluation of a search.
+
+    Each dot is drawn as a line of length 0 with round ends. So all dots are a single
+    path in the SVG, which keeps the page small.
+
+    Args:
+        axes: axes of matplotlib, on which it is drawn.
+        numbers: (n,) number of each evaluation, from 1.
+        objectives: (n,) objective of each evaluation; NaN is not drawn.
+        colour: colour of the dots.
+    """
+    axes.plot(
+        _as_dots(numbers),
+        _as_dots(objectives),
+        solid_capstyle="round",
+        linewidth=4,
+        alpha=0.35,
+        color=colour,
+    )
 
 
 def draw_heat_map(
@@ -368,12 +390,11 @@ def draw_marks(picture: Any, shapes: Sequence[Shape]) -> Floats:
     Returns:
         The drawing (h, w, 3), float32 in [0, 1].
     """
-    levels = to_8bit(picture)
-    height, width = levels.shape[:2]
+    original = Image.fromarray(to_8bit(picture))
     # rounded up, so that the longest side has MIN_IMAGE_SIDE pixels at least
-    factor = max(1, math.ceil(MIN_IMAGE_SIDE / max(height, width)))
-    size = (width * factor, height * factor)
-    image = Image.fromarray(levels).resize(size, Image.Resampling.NEAREST)
+    factor = max(1, math.ceil(MIN_IMAGE_SIDE / max(original.size)))
+    size = (original.width * factor, original.height * factor)
+    image = original.resize(size, Image.Resampling.NEAREST)
     # True masks are drawn last, so that they stay visible (False sorts before True).
     for shape in sorted(shapes, key=lambda shape: shape.true):
         if shape.mask is not None:
@@ -462,22 +483,33 @@ def _make_map_panels(
         size: (width, height) of each returned image in pixels.
         font: font of the texts.
     """
-    maps = sorted(
-        (shape for shape in shapes if shape.map is not None),
-        key=lambda shape: not shape.true,  # False, of the true map, sorts first
-    )
-    if not maps:
+    shapes_with_map = [shape for shape in shapes if shape.map is not None]
+    # False, of the true map, sorts first
+    shapes_with_map.sort(key=lambda shape: not shape.true)
+    if not shapes_with_map:
         return []
-    lower = float(maps[0].map.min())
-    upper = float(maps[0].map.max())
-    panels = []
-    for shape in maps:
-        grey_image = _make_grey_image(shape.map, lower, upper)
-        panel = grey_image.resize(size, Image.Resampling.NEAREST).convert("RGB")
-        frame = (0, 0, size[0] - 1, size[1] - 1)
-        _write_label(ImageDraw.Draw(panel), shape, frame, size, font, [])
-        panels.append(panel)
-    return panels
+    first_map = shapes_with_map[0].map
+    limits = (float(first_map.min()), float(first_map.max()))
+    return [_make_map_panel(shape, limits, size, font) for shape in shapes_with_map]
+
+
+def _make_map_panel(
+    shape: Shape, limits: tuple[float, float], size: tuple[int, int], font: Any
+) -> Image.Image:
+    """Return the map of a shape as a grey image with its text.
+
+    Args:
+        shape: a mark with a map (h, w).
+        limits: the values that are black and white.
+        size: (width, height) of the image in pixels.
+        font: font of the text.
+    """
+    lower, upper = limits
+    grey_image = _make_grey_image(shape.map, lower, upper)
+    panel = grey_image.resize(size, Image.Resampling.NEAREST).convert("RGB")
+    frame = (0, 0, size[0] - 1, size[1] - 1)
+    _write_label(ImageDraw.Draw(panel), shape, frame, size, font, text_boxes=[])
+    return panel
 
 
 def _make_grey_image(values: Any, lower: float, upper: float) -> Image.Image:
@@ -602,19 +634,33 @@ def _find_free_height(
         size: (width, height) of the text.
         text_boxes: (x0, y0, x1, y1) of the other texts.
     """
-    width, height = size
-
-    def is_free(y: int) -> bool:
-        """Return whether the text would cover no other one at this height."""
-        # it lies to the right or left of each other text, or below or above it
-        return all(
-            x > x1 or x0 > x + width or y > y1 or y0 > y + height
-            for x0, y0, x1, y1 in text_boxes
-        )
-
     # by distance from the preferred height; of two at the same distance, the upper one
     nearest_first = sorted(range(max_y + 1), key=lambda y: (abs(y - preferred_y), y))
-    return next(filter(is_free, nearest_first), preferred_y)
+    for y in nearest_first:
+        if _is_free_position((x, y), size, text_boxes):
+            return y
+    return preferred_y
+
+
+def _is_free_position(
+    corner: tuple[int, int],
+    size: tuple[int, int],
+    text_boxes: Sequence[tuple[int, int, int, int]],
+) -> bool:
+    """Return whether a text would cover no other one at a position.
+
+    Args:
+        corner: (left, top) of the text.
+        size: (width, height) of the text.
+        text_boxes: (x0, y0, x1, y1) of the other texts.
+    """
+    x, y = corner
+    width, height = size
+    # it lies to the right or left of each other text, or below or above it
+    return all(
+        x > x1 or x0 > x + width or y > y1 or y0 > y + height
+        for x0, y0, x1, y1 in text_boxes
+    )
 
 
 # In pixels: the gap between tiles, and the heights of a line of text and of its font.

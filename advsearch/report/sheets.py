@@ -421,15 +421,24 @@ def _make_cover(
     x = MARGIN
     y = MARGIN + 5.0
     axes.text(x, y, title, fontsize=14, va="top")
-    # the square to measure, below the title
-    top = y + 15.0
-    right = x + SQUARE
-    bottom = y + 15.0 + SQUARE
-    _draw_line(axes, [x, right, right, x, x], [top, top, bottom, bottom, top])
+    square_top = y + 15.0  # below the title
+    square_bottom = y + 15.0 + SQUARE
+    _draw_measured_square(axes, x, square_top, square_bottom)
     text = "\n".join(_list_cover_lines(pieces, sheets, profile))
-    axes.text(x, bottom + 10.0, text, fontsize=9, va="top", linespacing=1.6)
+    axes.text(x, square_bottom + 10.0, text, fontsize=9, va="top", linespacing=1.6)
     _draw_ruler(axes, paper)
     return figure
+
+
+def _draw_measured_square(axes: Axes, left: float, top: float, bottom: float) -> None:
+    """Draw the square that the user measures to check the scale of the printer.
+
+    Args:
+        axes: axes of the page, in millimetres.
+        left, top, bottom: sides of the square, in millimetres.
+    """
+    right = left + SQUARE
+    _draw_line(axes, [left, right, right, left, left], [top, top, bottom, bottom, top])
 
 
 def _list_cover_lines(
@@ -443,7 +452,7 @@ def _list_cover_lines(
         profile: the ICC profile to which colors were converted; None for sRGB.
     """
     colours = "sRGB" if profile is None else f"converted from sRGB by {profile.name}"
-    lines = [
+    return [
         f'{sheets} sheets follow. Print all pages at 100 % ("actual size"), then '
         "measure this square: "
         f"{SQUARE:g} mm a side.",
@@ -452,11 +461,18 @@ def _list_cover_lines(
         "",
         *CHECKLIST,
         "",
-        *[
-            f"{piece.name}: {piece.size[0]:.1f} x {piece.size[1]:.1f} mm"
-            for piece in pieces[:MAX_LISTED_PIECES]
-        ],
+        *_list_piece_lines(pieces),
     ]
+
+
+def _list_piece_lines(pieces: Sequence[Piece]) -> list[str]:
+    """Return a line with name and size for each piece, up to `MAX_LISTED_PIECES`, and
+    one with the number of further pieces.
+    """
+    lines = []
+    for piece in pieces[:MAX_LISTED_PIECES]:
+        width, height = piece.size
+        lines.append(f"{piece.name}: {width:.1f} x {height:.1f} mm")
     n_unlisted = len(pieces) - MAX_LISTED_PIECES
     if n_unlisted > 0:
         lines.append(f"and {n_unlisted} more")

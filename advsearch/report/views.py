@@ -302,10 +302,9 @@ def make_default_view(result: Result) -> ShownResult:
     row_lists = {name: value for name, value in values.items() if _is_table(value)}
     facts = _find_plain_facts(result, values, row_lists)
     tables = [_make_table(name, rows) for name, rows in row_lists.items()]
+    names_of_facts = {name for name, text in facts.items() if text}
     # pairs of an object with fields, and the names of its fields that are on the page
-    objects_with_words: list[tuple[Fields, set[str]]] = [
-        (result, {name for name, text in facts.items() if text})
-    ]
+    objects_with_words: list[tuple[Fields, set[str]]] = [(result, names_of_facts)]
     for rows, table in zip(row_lists.values(), tables, strict=True):
         objects_with_words.append((rows[0], set(table.column_heads)))
     sections = [*tables, _explain_words(objects_with_words)]
@@ -694,12 +693,7 @@ def make_notebook_html(
     figures = [
         _make_figure_html(name, image) for name, image in (pictures or {}).items()
     ]
-    figure = render_result_figure(view)
-    chart = None
-    if figure:
-        chart = _make_image(
-            figure["png"], 2 * DISPLAY_WIDTH, "the numbers of the table"
-        )
+    chart = _make_chart_image(view)
     sections = [
         _make_section_html(part)
         for part in view.sections
@@ -708,6 +702,14 @@ def make_notebook_html(
     return make_element(
         "div", make_element("p", view.statement), *figures, chart, *sections
     )
+
+
+def _make_chart_image(view: ShownResult) -> Html | None:
+    """Return the charts of a result as an image element; None if it has none."""
+    figure = render_result_figure(view)
+    if not figure:
+        return None
+    return _make_image(figure["png"], 2 * DISPLAY_WIDTH, "the numbers of the table")
 
 
 def _make_figure_html(name: str, image: ArrayLike) -> Html:
@@ -870,6 +872,17 @@ def _draw_page_chart(
     figure.legend(loc="outside upper left", ncols=columns, labelcolor=COLORS["soft"])
 
 
+_UNNEEDED_IN_SVG = (
+    r"<clipPath.*?</clipPath>",
+    r"<!--.*?-->",
+    r' clip-path="[^"]*"',
+    # Digits after the first decimal: they follow "1.2", and are inside of a tag, since
+    # ">" is the next angle bracket.
+    r"(?<=\d\.\d)\d+(?=[^<>]*>)",
+)
+"""Patterns of what is left out of an SVG file that is inserted into a page."""
+
+
 def _make_inline_svg(svg: str, prefix: str) -> Html:
     """Return the shapes of an SVG file as small markup to insert into a page.
 
@@ -884,15 +897,7 @@ def _make_inline_svg(svg: str, prefix: str) -> Html:
     """
     # from the first group of shapes to the end of the file
     shapes = svg[svg.index("<g ") : svg.rindex("</svg>")]
-    unneeded_patterns = (
-        r"<clipPath.*?</clipPath>",
-        r"<!--.*?-->",
-        r' clip-path="[^"]*"',
-        # Digits after the first decimal: they follow "1.2", and are inside of a tag,
-        # since ">" is the next angle bracket.
-        r"(?<=\d\.\d)\d+(?=[^<>]*>)",
-    )
-    shapes = re.sub("|".join(unneeded_patterns), "", shapes, flags=re.DOTALL)
+    shapes = re.sub("|".join(_UNNEEDED_IN_SVG), "", shapes, flags=re.DOTALL)
     shapes = _prefix_ids(shapes, prefix)
     shapes = re.sub(r"<defs>\s*</defs>", "", shapes)
     for name, color in (*COLORS.items(), *FIGURE_COLORS.items()):

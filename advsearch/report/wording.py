@@ -146,8 +146,18 @@ def format_percent_number(fraction: float, max_decimals: int = MAX_DECIMALS) -> 
     if text not in ("0", "100"):
         return text
     # Even with `max_decimals` it was rounded to 0 or 100.
+    return _format_unreached_limit(text, decimals)
+
+
+def _format_unreached_limit(limit: str, decimals: int) -> str:
+    """Return a percentage that is too close to a limit to be told from it.
+
+    Args:
+        limit: the limit, "0" or "100".
+        decimals: number of decimals with which the percentage is rounded to it.
+    """
     last_digit = 10.0**-decimals  # such as 0.0001 for four decimals
-    if text == "0":
+    if limit == "0":
         return f"under {last_digit:.{decimals}f}"
     return f"over {100.0 - last_digit:.{decimals}f}"
 
@@ -227,17 +237,14 @@ def _format_rate_difference(pair: Any) -> str:
         pair: `PairedRates`, whose difference is a fraction.
     """
     lower, upper = (100.0 * bound for bound in pair.interval)
+    interval = f"{lower:.0f} to {upper:.0f}"
+    direction = "more"
     if pair.difference < 0:
         # The word "fewer" states the sign. The bounds are negated, and so swap places.
         interval = f"{-upper:.0f} to {-lower:.0f}"
         direction = "fewer"
-    else:
-        interval = f"{lower:.0f} to {upper:.0f}"
-        direction = "more"
-    doubt = ""
     contains_zero = not (lower > 0.0 or upper < 0.0)
-    if contains_zero:
-        doubt = "; that there is a difference is not shown"
+    doubt = "; that there is a difference is not shown" if contains_zero else ""
     return (
         f"{abs(100.0 * pair.difference):.0f} points {direction} "
         f"(95 % interval of pairs {interval}){doubt}"
@@ -378,6 +385,16 @@ def format_prediction(task: str, prediction: AnyPrediction) -> str:
         return f"{label} ({number})"
     if task != SEGMENTATION:
         return f"{label}, {number}"
+    return _format_segmentation(label, prediction)
+
+
+def _format_segmentation(label: str, prediction: AnyPrediction) -> str:
+    """Return a prediction of segmentation on one line.
+
+    Args:
+        label: the label that the prediction has in a table.
+        prediction: has the accuracy as its probability, and perhaps a payload.
+    """
     accuracy = f"accuracy over the object's pixels {percent(prediction.probability)}"
     outcome = get_outcome(getattr(prediction, "payload", None))
     if outcome is Outcome.MISSED:
@@ -657,13 +674,18 @@ def format_workers(shared: SharedWork | None) -> str:
         alive = format_seconds(shared.alive)
         texts.append(f"busy {percent(shared.utilisation)} of {alive}")
     texts.append(f"loading took {format_seconds(shared.loading)}")
+    texts += _list_worker_events(shared)
+    return ", ".join(texts)
+
+
+def _list_worker_events(shared: SharedWork) -> list[str]:
+    """Return the events that happened to workers, with their counts."""
     counts = {
         "lost": shared.lost,
         "refused": shared.refused,
         "given out again": shared.retried,
     }
-    texts += [f"{count} {event}" for event, count in counts.items() if count]
-    return ", ".join(texts)
+    return [f"{count} {event}" for event, count in counts.items() if count]
 
 
 def format_formation(
@@ -677,15 +699,7 @@ def format_formation(
         gains: gains by scene, if each scene has its own. A scene is named by its object
             and environment, as in "mug, studio".
     """
-    height, width = formation.resolution
-    denoised = "not denoised"
-    if formation.denoiser != "none":
-        denoised = f"denoised ({formation.denoiser})"
-    description = (
-        f"{height} x {width} pixels, {formation.filter} filter, {denoised}, "
-        f"exposure {format_number(formation.exposure)} stops, "
-        f"sampler {formation.sampler}"
-    )
+    description = _describe_formation_without_gain(formation)
     if formation.gain is not None:
         return f"{description}, gain {format_number(formation.gain)}"
     description += ", a gain for each scene"
@@ -749,6 +763,19 @@ NO_TWINS = (
     "How far this holds for photographs was not measured. advsearch twins does; name its "
     "run in `twins`."
 )
+
+
+def _describe_formation_without_gain(formation: Formation) -> str:
+    """Return how images were computed, without the gain of their brightness."""
+    height, width = formation.resolution
+    denoised = "not denoised"
+    if formation.denoiser != "none":
+        denoised = f"denoised ({formation.denoiser})"
+    return (
+        f"{height} x {width} pixels, {formation.filter} filter, {denoised}, "
+        f"exposure {format_number(formation.exposure)} stops, "
+        f"sampler {formation.sampler}"
+    )
 
 
 def format_twin_evidence(evidence: TwinEvidence) -> str:
