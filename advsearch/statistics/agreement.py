@@ -120,6 +120,18 @@ def correlation_interval(
     value = statistic(first, second)
     if not math.isfinite(value) or not np.isfinite(values_without_unit).all():
         return None
+    return _compute_fisher_interval(value, values_without_unit)
+
+
+def _compute_fisher_interval(
+    value: float, values_without_unit: FloatArray
+) -> tuple[float, float]:
+    """Return the 95 % interval of a coefficient by the jackknife of Fisher's z.
+
+    Args:
+        value: the coefficient of all rows.
+        values_without_unit: (m,) the coefficient without the rows of each unit.
+    """
     half_width = _compute_jackknife_half_width(_to_fisher_z(values_without_unit))
     center = float(_to_fisher_z(np.array(value)))
     # tanh turns Fisher's z into a coefficient again
@@ -177,15 +189,31 @@ def estimate_rate(
     n_units = len(np.unique(units))
     if n_units == n_rows:
         return rate, clopper_pearson(int(event.sum()), n_rows)
-    # The sums of residuals over units are independent, so their squares add up to the
-    # variance of the rate. m / (m - 1) corrects for the estimated mean of m units.
-    unit_residual = sum_per_unit(event - rate, units)
-    variance = float((unit_residual**2).sum()) / n_rows**2
-    variance *= n_units / max(n_units - 1, 1)
+    variance = _compute_rate_variance(event - rate, units)
     n_effective = float(n_units)
     if variance > 0.0 and n_units > 1:
         n_effective = _count_effective_rows(rate, variance, n_rows, n_units)
     return rate, _make_beta_interval(rate * n_effective, n_effective)
+
+
+def _compute_rate_variance(residuals: FloatArray, units: IntArray) -> float:
+    """Return the variance of a rate over rows that are grouped in units.
+
+    The sums of residuals over units are independent, so their squares add up to the
+    variance of the rate.
+
+    Args:
+        residuals: (n,) 1 minus the rate for rows in which the event happens, else 0
+            minus the rate.
+        units: (n,) unit of each row.
+    """
+    n_rows = len(units)
+    n_units = len(np.unique(units))
+    unit_residual = sum_per_unit(residuals, units)
+    variance = float((unit_residual**2).sum()) / n_rows**2
+    # m / (m - 1) corrects for the estimated mean of m units
+    variance *= n_units / max(n_units - 1, 1)
+    return variance
 
 
 def _count_effective_rows(

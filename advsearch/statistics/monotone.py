@@ -73,34 +73,46 @@ def find_dips(
     Returns:
         At most one dip for each distance, the nearest first.
     """
+    # the last distance has none beyond
+    dips = [
+        _find_dip(near, distances, right, counts) for near in range(len(distances) - 1)
+    ]
+    return tuple(dip for dip in dips if dip is not None)
+
+
+def _find_dip(
+    near: int,
+    distances: Sequence[float],
+    right: NDArray[np.int64],
+    counts: NDArray[np.int64],
+) -> Dip | None:
+    """Return the clearest dip at a distance; None if all ranges beyond have lower rates.
+
+    Args:
+        near: index of the distance.
+        distances: m distances in ascending order.
+        right: (m,) number of images with a right prediction at each distance.
+        counts: (m,) number of images at each distance.
+    """
     n_distances = len(distances)
     n_comparisons = n_distances * (n_distances - 1) / 2.0
-    # sums over the distances before each index
-    right_before = np.concatenate([[0], np.cumsum(right)])
-    counts_before = np.concatenate([[0], np.cumsum(counts)])
-    dips = []
-    for near in range(n_distances - 1):
-        # Every range that begins right behind this distance, by its end: the index
-        # after its last distance.
-        end = np.arange(near + 2, n_distances + 1)
-        right_beyond = right_before[end] - right_before[near + 1]
-        counts_beyond = counts_before[end] - counts_before[near + 1]
-        clearest = _find_clearest_dip(
-            right[near], counts[near], right_beyond, counts_beyond
-        )
-        if clearest is None:
-            continue
-        best, p_value = clearest
-        dip = Dip(
-            distance=float(distances[near]),
-            counts=(int(right[near]), int(counts[near])),
-            # last distance of the range: `best` counts from the one behind `near`
-            until=float(distances[near + 1 + best]),
-            counts_beyond=(int(right_beyond[best]), int(counts_beyond[best])),
-            p_value=min(1.0, p_value * n_comparisons),
-        )
-        dips.append(dip)
-    return tuple(dips)
+    # for every range that begins right behind this distance
+    right_beyond = np.cumsum(right[near + 1 :])
+    counts_beyond = np.cumsum(counts[near + 1 :])
+    clearest = _find_clearest_dip(
+        right[near], counts[near], right_beyond, counts_beyond
+    )
+    if clearest is None:
+        return None
+    best, p_value = clearest
+    return Dip(
+        distance=float(distances[near]),
+        counts=(int(right[near]), int(counts[near])),
+        # last distance of the range: `best` counts from the one behind `near`
+        until=float(distances[near + 1 + best]),
+        counts_beyond=(int(right_beyond[best]), int(counts_beyond[best])),
+        p_value=min(1.0, p_value * n_comparisons),
+    )
 
 
 def _find_clearest_dip(

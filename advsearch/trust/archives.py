@@ -310,16 +310,30 @@ def _read_code(archive: Archive) -> dict[str, bytes]:
         if name.startswith("code/") and name.endswith(".py")
     ]
     code = {name: archive.read_member(name, LARGEST_CODE) for name in scripts}
+    _check_code(archive.path, code)
+    return code
+
+
+def _check_code(path: Path, code: Mapping[str, bytes]) -> None:
+    """Check the source code of a TorchScript archive.
+
+    Args:
+        path: path of the archive, for errors.
+        code: content of the members with source code, by name.
+
+    Raises:
+        FileFormatError: there is too much code, or it calls functions that a network
+            does not need.
+    """
     if sum(map(len, code.values())) > LARGEST_CODE:
         raise make_archive_error(
-            archive.path, f"has more than {LARGEST_CODE:,} bytes of source code"
+            path, f"has more than {LARGEST_CODE:,} bytes of source code"
         )
     for name, content in code.items():
         if wrong := _find_code_problem(content):
             raise make_archive_error(
-                archive.path, f"{name!r} {wrong}, which no plain network does"
+                path, f"{name!r} {wrong}, which no plain network does"
             )
-    return code
 
 
 def _read_version(archive: Archive) -> int:
@@ -353,12 +367,16 @@ def _find_code_problem(content: bytes) -> str:
     families = _NATIVE_CLASS.findall(text)
     if not _HARMLESS_FAMILIES.issuperset(families):
         return "uses native classes other than those of quantized networks"
-    has_control_character = any(
-        ord(char) < 32 and ord(char) not in _WHITE_SPACE_CODES for char in text
-    )
-    if has_control_character or any(map(_hides_character, _ESCAPE.findall(text))):
+    if _has_control_character(text) or any(
+        map(_hides_character, _ESCAPE.findall(text))
+    ):
         return "has text with hidden characters"
     return ""
+
+
+def _has_control_character(text: str) -> bool:
+    """Return whether a text has a control character other than white space."""
+    return any(ord(char) < 32 and ord(char) not in _WHITE_SPACE_CODES for char in text)
 
 
 def _hides_character(escape: str) -> bool:
@@ -523,11 +541,10 @@ def _check_values(archive: Archive, name: str, value: Any) -> None:
             raise make_archive_error(
                 archive.path, f"{name!r} has text with hidden characters"
             )
-        new_by_id = dict[int, Any]()
-        for outer in level:
-            for inner in _list_inner_values(outer):
-                if id(inner) not in checked_ids:
-                    new_by_id[id(inner)] = inner
+        inner_values = chain.from_iterable(map(_list_inner_values, level))
+        new_by_id = {
+            id(inner): inner for inner in inner_values if id(inner) not in checked_ids
+        }
         level = list(new_by_id.values())
         checked_ids.update(new_by_id)
         if not level:

@@ -91,17 +91,20 @@ def find_expression_problem(text: object) -> str:
         tree = ast.parse(text.strip(), mode="eval")
         _check(tree.body, DEPTH, EXPONENT)
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-        reason = "it cannot be read"
-        # `_check` raises a plain ValueError, whose message is for the user. Its
-        # subclasses, such as UnicodeError, and the other errors come from Python's
-        # parser.
-        if type(error) is ValueError:
-            reason = str(error.args[0])
         return (
             "expected arithmetic with whole numbers and symbols, got "
-            f"{text[:60]!r} ({reason})"
+            f"{text[:60]!r} ({_get_refusal_reason(error)})"
         )
     return ""
+
+
+def _get_refusal_reason(error: Exception) -> str:
+    """Return why an expression is refused, from the error of reading or checking it."""
+    # `_check` raises a plain ValueError, whose message is for the user. Its subclasses,
+    # such as UnicodeError, and the other errors come from Python's parser.
+    if type(error) is ValueError:
+        return str(error.args[0])
+    return "it cannot be read"
 
 
 def _check(node: ast.expr, depth: int, max_power: int) -> None:
@@ -259,11 +262,9 @@ def _divide_max_power(exponent: ast.expr, max_power: int) -> int:
     match exponent:
         case ast.Call(func=ast.Name(id="Integer"), args=[number]):
             exponent = _without_sign(number)
-    if isinstance(exponent, ast.Call) and ast.unparse(exponent) in (
-        "Rational(1, 2)",
-        "Rational(-1, 2)",
-    ):
-        return max_power
+    is_call = isinstance(exponent, ast.Call)
+    if is_call and ast.unparse(exponent) in ("Rational(1, 2)", "Rational(-1, 2)"):
+        return max_power  # a root
     value = _get_constant(exponent)
     if not isinstance(value, int) or isinstance(value, bool) or value > max_power:
         raise ValueError("an exponent that is not a small number")
@@ -570,17 +571,28 @@ def _check_value(path: Path, value: JsonValue, key: str) -> Any:
         if problem:
             raise make_archive_error(path, problem)
         return value
-    checked: JsonObject = {}
-    for name, inner in value.items():
-        if name in _EMPTIED_ENTRIES:
-            # The value is not used, so that it needs no check.
-            checked[name] = _EMPTIED_ENTRIES[name]
-            continue
-        problem = _find_entry_problem(name, inner, key)
-        if problem:
-            raise make_archive_error(path, problem)
-        checked[name] = _check_value(path, inner, name)
-    return checked
+    return {name: _check_entry(path, name, inner, key) for name, inner in value.items()}
+
+
+def _check_entry(path: Path, name: str, value: JsonValue, key: str) -> Any:
+    """Check an entry of a mapping, and return its value as `_check_value` does.
+
+    Args:
+        path: path of the archive, for errors.
+        name: name of the entry.
+        value: value of the entry.
+        key: name of the entry that holds the mapping.
+
+    Raises:
+        FileFormatError: the entry cannot be part of a plain network.
+    """
+    if name in _EMPTIED_ENTRIES:
+        # The value is not used, so that it needs no check.
+        return _EMPTIED_ENTRIES[name]
+    problem = _find_entry_problem(name, value, key)
+    if problem:
+        raise make_archive_error(path, problem)
+    return _check_value(path, value, name)
 
 
 def _find_entry_problem(name: str, value: JsonValue, key: str) -> str:

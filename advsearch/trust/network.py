@@ -43,15 +43,8 @@ def check_address(spec: str) -> SplitResult:
         InputError: it has no host; it contains a secret, which would be stored with the
             run; or the key from the environment would be sent there unencrypted.
     """
-    try:
-        address = urlsplit(spec)
-        host = address.hostname
-        # Only for the check: an invalid port raises ValueError.
-        _ = address.port
-    except ValueError as error:
-        raise InputError(
-            f"model {spec!r}: expected an address, http://HOST:PORT/PATH ({error})"
-        ) from None
+    address = _parse_address(spec)
+    host = address.hostname
     is_plain = spec.isascii() and spec.isprintable() and " " not in spec
     if not host or not is_plain:
         raise InputError(f"model {spec!r}: expected an address, http://HOST:PORT/PATH")
@@ -61,6 +54,23 @@ def check_address(spec: str) -> SplitResult:
             f"model {spec}: the key in {KEY} would go there unencrypted; "
             f"use https, or unset {KEY}"
         )
+    return address
+
+
+def _parse_address(spec: str) -> SplitResult:
+    """Return the parts of a model's address, of which the host and the port are valid.
+
+    Raises:
+        InputError: it is no address.
+    """
+    try:
+        address = urlsplit(spec)
+        # Only for the check: an invalid host or port raises ValueError.
+        _ = address.hostname, address.port
+    except ValueError as error:
+        raise InputError(
+            f"model {spec!r}: expected an address, http://HOST:PORT/PATH ({error})"
+        ) from None
     return address
 
 
@@ -172,11 +182,14 @@ def _write_certificate(hosts: Sequence[str], key: Path, certificate: Path) -> No
             "install openssl, or leave `host` and `https` out"
         ) from None
     except (OSError, subprocess.SubprocessError) as error:
-        output: bytes = getattr(error, "stderr", None) or b""
-        text = output.decode(errors="replace")[-300:]  # the end has the reason
-        raise InputError(
-            f"https: openssl made no certificate: {text or error}"
-        ) from None
+        raise _make_openssl_error(error) from None
+
+
+def _make_openssl_error(error: OSError | subprocess.SubprocessError) -> InputError:
+    """Return the error for a failure of openssl, with the end of what it printed."""
+    output: bytes = getattr(error, "stderr", None) or b""
+    text = output.decode(errors="replace")[-300:]  # the end has the reason
+    return InputError(f"https: openssl made no certificate: {text or error}")
 
 
 def _make_openssl_command(

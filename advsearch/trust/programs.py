@@ -94,10 +94,7 @@ def find_blender(who: str, otherwise: str) -> list[str]:
     Raises:
         FileFormatError: there is no Blender.
     """
-    program = os.environ.get(BLENDER) or shutil.which("blender")
-    if program is None and importlib.util.find_spec("bpy") is not None:
-        # this Python has Blender as a package
-        program = sys.executable
+    program = _find_blender_program()
     executable = shutil.which(program or "")
     if executable is None:
         raise _make_blender_error(program, who, otherwise)
@@ -109,13 +106,19 @@ def find_blender(who: str, otherwise: str) -> list[str]:
     # If the script fails, the exit status is 1.
     return [
         program,
-        "--background",
-        "--factory-startup",
-        "--disable-autoexec",
-        "--python-exit-code",
-        "1",
-        "--python",
+        *("--background", "--factory-startup", "--disable-autoexec"),
+        *("--python-exit-code", "1", "--python"),
     ]
+
+
+def _find_blender_program() -> str | None:
+    """Return the name or path of Blender, or of a Python with the package `bpy`; None
+    if there is neither.
+    """
+    program = os.environ.get(BLENDER) or shutil.which("blender")
+    if program is None and importlib.util.find_spec("bpy") is not None:
+        return sys.executable  # this Python has Blender as a package
+    return program
 
 
 def _make_blender_error(

@@ -235,11 +235,7 @@ def check_not_moved(path: Path) -> None:
         if folder not in _open:
             continue
         results = _open[folder]
-        try:
-            is_same_file = _get_file_id(results.path.stat()) == results.file_id
-        except OSError:
-            is_same_file = False
-        if not is_same_file:
+        if not _is_same_file(results.path, results.file_id):
             raise StorageError(
                 f"{folder}: the folder of this run was removed or renamed while the "
                 "run went on; start it again, or go on with what was renamed by "
@@ -248,6 +244,19 @@ def check_not_moved(path: Path) -> None:
 
 
 LOCK = ".lock"
+
+
+def _is_same_file(path: Path, file_id: tuple[int, int]) -> bool:
+    """Return whether a path still leads to the file that it led to.
+
+    Args:
+        path: path of the file.
+        file_id: what `_get_file_id` returned for the file before.
+    """
+    try:
+        return _get_file_id(path.stat()) == file_id
+    except OSError:
+        return False
 
 
 def _make_lock_error(folder: Path, error: OSError, pid: str) -> Exception:
