@@ -137,11 +137,21 @@ def check_types(
         if is_array:
             continue
         _check_type(name, value, str(parameter.annotation))
-        if name == "run" and isinstance(value, str) and not value.strip():
-            raise InputError(
-                "run: expected the name of a run or a folder, got an empty text; leave "
-                "it out for no run"
-            )
+        if name == "run":
+            _check_run_name(value)
+
+
+def _check_run_name(run: object) -> None:
+    """Check that the name of a run is no empty text.
+
+    Raises:
+        InputError: it is.
+    """
+    if isinstance(run, str) and not run.strip():
+        raise InputError(
+            "run: expected the name of a run or a folder, got an empty text; leave "
+            "it out for no run"
+        )
 
 
 def _check_type(name: str, value: object, annotation: str) -> None:

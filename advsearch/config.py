@@ -67,6 +67,11 @@ def _make_paths_absolute(value: Mapping[Any, Any]) -> dict[Any, Any]:
     return options
 
 
+def _split_joined_names(text: str) -> list[str]:
+    """Split a text at each + that is not inside of braces."""
+    return re.split(r"\+(?![^{]*\})", text)
+
+
 def parse_joined_names(value: Any, setting: str, default_name: str) -> Any:
     """Read a setting that is one name, or several names joined with + or in a list.
 
@@ -80,10 +85,7 @@ def parse_joined_names(value: Any, setting: str, default_name: str) -> Any:
         setting: name of the setting, for messages.
         default_name: name for a mapping that has none.
     """
-    entries = value
-    if isinstance(value, str):
-        # Split at each + that is not inside of braces.
-        entries = re.split(r"\+(?![^{]*\})", value)
+    entries = _split_joined_names(value) if isinstance(value, str) else value
     has_several_names = isinstance(entries, (list, tuple)) and len(entries) > 1
     if not has_several_names:
         return parse_name_with_options(value, setting, default_name)
@@ -483,12 +485,20 @@ class SceneConfig(Config):
                 _check_model_per_task(names, tasks)
             elif len(names) > 1 and setting_name not in self.list_settings:
                 raise make_single_value_error(setting_name, names)
+        self._check_size_of_one_object()
+        return self
+
+    def _check_size_of_one_object(self) -> None:
+        """Check that a size is not set for several objects.
+
+        Raises:
+            InputError: it is.
+        """
         if self.size is not None and len(self.objects) > 1:
             raise InputError(
                 "size: is the size of one object, and there are several; leave it out, "
                 "or use `unit`"
             )
-        return self
 
     @property
     def run_name_words(self) -> tuple[str, ...]:

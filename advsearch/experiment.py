@@ -245,17 +245,27 @@ def run_experiment(
     # If the caller passed Python objects, settings have names that need not exist.
     if not config.python_only_parts:
         check_names(dict(config))
-    # An experiment with `out` writes a file or folder of its own, and no run.
-    creates_run = resumed_directory is None and getattr(config, "out", None) is None
-    # The folder of a new run is created before slow imports, so that a run that is
-    # stopped early can be listed. Then the experiment continues in it as in a resumed
-    # run.
-    folder_context: AbstractContextManager[Path | None] = nullcontext(resumed_directory)
-    if creates_run:
-        folder_context = create_before_work(config)
-    with folder_context as folder:
+    with _open_run_folder(config, resumed_directory) as folder:
         experiment: Experiment[Result] = registry.get_experiment(config.command)
         return experiment.run(config, progress=progress, resumed_directory=folder)
+
+
+def _open_run_folder(
+    config: Config, resumed_directory: Path | None
+) -> AbstractContextManager[Path | None]:
+    """Return a context with the folder in which an experiment continues.
+
+    The folder of a new run is created before slow imports, so that a run that is
+    stopped early can be listed. Then the experiment continues in it as in a resumed
+    run.
+
+    Args:
+        config: settings of the experiment.
+        resumed_directory: folder of the run to continue; None for a new run.
+    """
+    # An experiment with `out` writes a file or folder of its own, and no run.
+    creates_run = resumed_directory is None and getattr(config, "out", None) is None
+    return create_before_work(config) if creates_run else nullcontext(resumed_directory)
 
 
 def find_stopped_run(config: Config) -> Path | None:

@@ -179,18 +179,34 @@ def check_direction(objective: object, *, targeted: bool) -> None:
         _check_not_of_torch(function)
     for name in __all__:
         counterpart = f"targeted_{name}"  # the same loss for a target
-        if counterpart not in __all__:
-            continue
-        if function is globals()[name] and targeted:
-            raise InputError(
-                f"objective: losses.{name} leads away from the `target`; "
-                f"take losses.{counterpart}"
-            )
-        if function is globals()[counterpart] and not targeted:
-            raise InputError(
-                f"objective: losses.{counterpart} needs a `target`; name one, or take "
-                f"losses.{name}"
-            )
+        if counterpart in __all__:
+            _check_not_counterpart(function, name, counterpart, targeted=targeted)
+
+
+def _check_not_counterpart(
+    function: object, name: str, counterpart: str, *, targeted: bool
+) -> None:
+    """Check that a function is not the wrong one of two losses.
+
+    Args:
+        function: the function.
+        name: name of the loss for a search without a target.
+        counterpart: name of the same loss for a search with a target.
+        targeted: whether the search has a target.
+
+    Raises:
+        InputError: it is the other one.
+    """
+    if function is globals()[name] and targeted:
+        raise InputError(
+            f"objective: losses.{name} leads away from the `target`; "
+            f"take losses.{counterpart}"
+        )
+    if function is globals()[counterpart] and not targeted:
+        raise InputError(
+            f"objective: losses.{counterpart} needs a `target`; name one, or take "
+            f"losses.{name}"
+        )
 
 
 def _check_not_of_torch(function: object) -> None:
@@ -215,6 +231,20 @@ def _check_not_of_torch(function: object) -> None:
 # ---- parts
 
 
+def _check_label_type(labels: object) -> None:
+    """Check that labels are those of classification: a tensor, or a label set.
+
+    Raises:
+        InputError: they are the truth of another task.
+    """
+    if not isinstance(labels, (Tensor, Sequence)):
+        raise InputError(
+            "labels: expected (N,) int64 or the indices of a label set, got "
+            f"{type(labels).__name__}, the truth of another task than classification; "
+            "a loss of your own takes it as it is"
+        )
+
+
 def _by_label(loss: Callable[..., Tensor], logits: Tensor, labels: Labels) -> Tensor:
     """Compute a loss of logits for their labels, (N,).
 
@@ -228,12 +258,7 @@ def _by_label(loss: Callable[..., Tensor], logits: Tensor, labels: Labels) -> Te
     Raises:
         InputError: the labels have another type, or do not fit the number of rows.
     """
-    if not isinstance(labels, (Tensor, Sequence)):
-        raise InputError(
-            "labels: expected (N,) int64 or the indices of a label set, got "
-            f"{type(labels).__name__}, the truth of another task than classification; "
-            "a loss of your own takes it as it is"
-        )
+    _check_label_type(labels)
     if not isinstance(labels, Tensor):  # a label set for all rows
         return loss(logits, logits, tuple(labels))
     label_sets = [(int(label),) for label in labels.flatten()]

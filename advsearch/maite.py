@@ -69,19 +69,24 @@ def _to_detections(target: Any) -> dict[str, Tensor]:
 
     It has boxes (n, 4), labels (n,) and scores (n,).
     """
-    scores = torch.as_tensor(target.scores).float()
-    if scores.ndim == 2:  # (n, classes); `labels` has the class with the best score
-        has_classes = scores.shape[1] > 0
-        if has_classes:
-            scores = scores.amax(dim=1)
-        else:  # `amax` would fail
-            scores = scores.new_zeros(len(scores))
+    scores = _get_best_scores(torch.as_tensor(target.scores).float())
     boxes = torch.as_tensor(target.boxes).float().reshape(-1, 4)
     return {
         "boxes": boxes,
         "labels": torch.as_tensor(target.labels).long(),
         "scores": scores,
     }
+
+
+def _get_best_scores(scores: Tensor) -> Tensor:
+    """Return the score (n,) of each detection, from scores (n,) or (n, classes)."""
+    if scores.ndim != 2:
+        return scores
+    # `labels` has the class with the best score
+    has_classes = scores.shape[1] > 0
+    if has_classes:
+        return scores.amax(dim=1)
+    return scores.new_zeros(len(scores))  # `amax` would fail
 
 
 def load_model(
@@ -111,11 +116,7 @@ def load_model(
     Raises:
         InputError: the task is another one.
     """
-    if task not in ("classification", "detection"):
-        raise InputError(
-            "task: expected classification or detection, which MAITE has "
-            f"protocols of, got {task!r}"
-        )
+    _check_task_of_maite(task)
     metadata = getattr(model, "metadata", {})
     if labels is None:
         labels = _list_class_labels(metadata)
@@ -299,10 +300,19 @@ def _check_scenes_arguments(task: str, count: int) -> None:
     Raises:
         InputError: the task is another one, or `count` is less than 1.
     """
-    if task not in ("classification", "detection"):
-        raise InputError(
-            "task: expected classification or detection, which MAITE "
-            f"has protocols of, got {task!r}"
-        )
+    _check_task_of_maite(task)
     if count < 1:
         raise InputError(f"count: expected a whole number from 1, got {count}")
+
+
+def _check_task_of_maite(task: str) -> None:
+    """Check that MAITE has a protocol for a task.
+
+    Raises:
+        InputError: it has none.
+    """
+    if task not in ("classification", "detection"):
+        raise InputError(
+            "task: expected classification or detection, which MAITE has protocols of, "
+            f"got {task!r}"
+        )

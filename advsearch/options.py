@@ -51,13 +51,29 @@ def group_mitsuba_keys(controls: Mapping[str, object]) -> dict[str, object]:
             plain[name] = _with_parameter(str(name), options)
     if not ranges:
         return plain
-    grouped = plain.get(MITSUBA_CONTROL) or {}
+    return {
+        **plain,
+        MITSUBA_CONTROL: _merge_ranges(plain.get(MITSUBA_CONTROL), ranges),
+    }
+
+
+def _merge_ranges(options: object, ranges: Mapping[str, object]) -> dict[str, object]:
+    """Return the options of the control of Mitsuba's parameters with further ranges.
+
+    Args:
+        options: options of the control; None if it has none.
+        ranges: ranges by key of the parameter.
+
+    Raises:
+        InputError: the options are no mapping, or a key has two ranges.
+    """
+    grouped = options or {}
     if not isinstance(grouped, Mapping) or grouped.keys() & ranges.keys():
         raise InputError(
             f"`controls` {MITSUBA_CONTROL}: expected each of Mitsuba's names once, "
             "with a range"
         )
-    return {**plain, MITSUBA_CONTROL: {**grouped, **ranges}}
+    return {**grouped, **ranges}
 
 
 def _check_mitsuba_range(name: str, key: str, options: object) -> None:

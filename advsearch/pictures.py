@@ -87,12 +87,21 @@ def check_decodable(image: Image.Image, path: Path | str) -> None:
             f"{image.format}; convert it"
         )
     if image.format in ("JPEG", "MPO"):
-        n_scans = _count_scans(image)
-        max_scans = scale_limit(MAX_SCANS)  # users may raise the limit
-        if n_scans > max_scans:
-            raise make_size_error(
-                path, f"a JPEG of at most {max_scans} scans", f"{n_scans}"
-            )
+        _check_scan_count(image, path)
+
+
+def _check_scan_count(image: Image.Image, path: Path | str) -> None:
+    """Check that a JPEG does not have too many scans.
+
+    Raises:
+        FileFormatError: it has.
+    """
+    n_scans = _count_scans(image)
+    max_scans = scale_limit(MAX_SCANS)  # users may raise the limit
+    if n_scans > max_scans:
+        raise make_size_error(
+            path, f"a JPEG of at most {max_scans} scans", f"{n_scans}"
+        )
 
 
 @contextlib.contextmanager

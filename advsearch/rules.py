@@ -344,15 +344,15 @@ class RuleCondition:
         if self.options:
             return " or ".join(sorted(self.options))
         is_angle = self.turn > 0.0
-        if is_angle:
-            arcs = [
-                f"from {start % 360:g} to {end % 360:g}" for start, end in self.arcs
-            ]
-            values_text = " or ".join(arcs)
-        else:
-            values_text = self._bounds_text
+        values_text = self._arcs_text if is_angle else self._bounds_text
         has_unit = self.unit not in ("", "1")  # "1" means a number without a unit
         return f"{values_text} {self.unit}" if has_unit else values_text
+
+    @property
+    def _arcs_text(self) -> str:
+        """The arcs of an angle that fulfil the condition, in degrees, as text."""
+        arcs = [f"from {start % 360:g} to {end % 360:g}" for start, end in self.arcs]
+        return " or ".join(arcs)
 
     @property
     def _bounds_text(self) -> str:

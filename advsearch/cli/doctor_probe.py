@@ -47,18 +47,26 @@ def probe_renderer() -> str:
     import drjit as dr  # what is probed
 
     brightness, slope = _render_wall(mi, dr)
+    _check_wall(brightness, slope)
+    version = ".".join(map(str, dr.detail.llvm_version()))
+    return (
+        f"{PIXELS} x {PIXELS} pixels and their gradient, {VARIANT}, LLVM {version}, "
+        f"{dr.thread_count()} threads"
+    )
+
+
+def _check_wall(brightness: float, slope: float) -> None:
+    """Check the brightness of the wall, and its derivative by the reflectance.
+
+    Raises:
+        ArithmeticError: they differ from 0.5 and 1 by more than noise.
+    """
     is_brightness_right = abs(brightness - 0.5) < NOISE
     is_slope_right = abs(slope - 1.0) < 2 * NOISE
     if not (is_brightness_right and is_slope_right):
         raise ArithmeticError(
             f"expected brightness 0.5 and slope 1, got {brightness:.4f} and {slope:.4f}"
         )
-    version = ".".join(map(str, dr.detail.llvm_version()))
-    return (
-        f"{PIXELS} x {PIXELS} pixels and their gradient, {VARIANT}, LLVM "
-        f"{version}, "
-        f"{dr.thread_count()} threads"
-    )
 
 
 def _render_wall(mi: Any, dr: Any) -> tuple[float, float]:

@@ -167,15 +167,24 @@ def resume(args: argparse.Namespace) -> int:
     """
     path = find_run(args.run)
     changes = parse_changes(args.change)
-    if not (path / CONFIG).is_file():
-        raise InputError(
-            f"{path}: expected a run with its {CONFIG}, got none; start it again"
-        )
+    _check_has_settings(path)
     command = read_command(path / CONFIG)
     if is_finished(path) and not _can_add_to_finished_run(command, changes):
         return _show_finished_run(path, as_json=args.json)
     _check_parts_are_stored(path)
     return run_file(path / CONFIG, changes, args, resumed_directory=path)
+
+
+def _check_has_settings(path: Path) -> None:
+    """Check that the folder of a run has its settings.
+
+    Raises:
+        InputError: it has none.
+    """
+    if not (path / CONFIG).is_file():
+        raise InputError(
+            f"{path}: expected a run with its {CONFIG}, got none; start it again"
+        )
 
 
 def _can_add_to_finished_run(command: str, changes: Mapping[str, object]) -> bool:

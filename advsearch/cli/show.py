@@ -72,11 +72,7 @@ def show(args: argparse.Namespace) -> int:
     Raises:
         InputError: the words name none of these.
     """
-    if args.picture and (args.json or len(args.what) > 1):
-        raise InputError(
-            "--picture: draws the pictures of one run, after its text; "
-            "give one run, and leave --json out"
-        )
+    _check_picture_flag(args)
     match args.what:
         case ["control" | "policy" | "task" as kind, name]:
             return _show_declared(kind, name, args.json)
@@ -89,6 +85,19 @@ def show(args: argparse.Namespace) -> int:
     raise InputError(
         f"expected the name of a run, or one of {kinds}, got {' '.join(args.what)!r}"
     )
+
+
+def _check_picture_flag(args: argparse.Namespace) -> None:
+    """Check that `--picture` is given for the text of one run only.
+
+    Raises:
+        InputError: it is given with `--json`, or for something else.
+    """
+    if args.picture and (args.json or len(args.what) > 1):
+        raise InputError(
+            "--picture: draws the pictures of one run, after its text; "
+            "give one run, and leave --json out"
+        )
 
 
 def _show_choice(command: str, name: str, as_json: bool) -> int:
@@ -561,16 +570,27 @@ def list_all(args: argparse.Namespace) -> int:
         kinds = [kind for kind in REGISTRIES if kind != CASES]
     with open_answer_progress():
         names = {kind: list_names(kind) for kind in kinds}
+    text = _format_names_of_kinds(names, with_headings=args.kind == "all")
+    facts = {kind: list(entries) for kind, entries in names.items()}
+    return output.print_answer(args.json, facts, text)
+
+
+def _format_names_of_kinds(
+    names: Mapping[str, Mapping[str, str]], *, with_headings: bool
+) -> str:
+    """Return a table of names for each kind as text.
+
+    Args:
+        names: names of each kind, with a description of each.
+        with_headings: whether each table has its kind as a heading.
+    """
     tables = {
         kind: output.align_columns([*entries.items()])
         for kind, entries in names.items()
     }
-    if args.kind == "all":
-        text = "\n\n".join(f"{kind}:\n{table}" for kind, table in tables.items())
-    else:
-        text = tables[args.kind]
-    facts = {kind: list(entries) for kind, entries in names.items()}
-    return output.print_answer(args.json, facts, text)
+    if with_headings:
+        return "\n\n".join(f"{kind}:\n{table}" for kind, table in tables.items())
+    return "\n\n".join(tables.values())
 
 
 @command(

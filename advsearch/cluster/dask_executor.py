@@ -718,12 +718,25 @@ def parse_site(workers: int | None, cluster: str) -> ClusterSite:
             "cluster: expected the address of a scheduler such as tcp://10.0.0.1:8786, "
             f"local, or a .yaml file, got {cluster!r}"
         )
+    _check_no_worker_number(site, workers)
+    return site
+
+
+def _check_no_worker_number(site: ClusterSite, workers: int | None) -> None:
+    """Check that no number of workers is set for a scheduler, which has workers.
+
+    Args:
+        site: the scheduler or the cluster.
+        workers: number of workers to start; None if it is not set.
+
+    Raises:
+        InputError: it is.
+    """
     if site.address and workers is not None:
         raise InputError(
             "workers: the scheduler of `cluster` says how many there are; "
             "leave one of the two out"
         )
-    return site
 
 
 def _read_site(path: Path, workers: int | None) -> ClusterSite:

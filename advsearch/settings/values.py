@@ -52,11 +52,7 @@ def to_text(value: Any, *, several: bool = False) -> Any:
             names where one is expected.
     """
     items = value if isinstance(value, (list, tuple)) else [value]
-    are_names = all(
-        isinstance(item, (str, Path, int)) and not isinstance(item, bool)
-        for item in items
-    )
-    if not items or not are_names:
+    if not items or not all(map(_is_name_or_number, items)):
         return value
     if len(items) > 1 and not several:
         raise ValueError("several")
@@ -65,6 +61,11 @@ def to_text(value: Any, *, several: bool = False) -> Any:
     if has_no_name or "\0" in text:  # no name and no path contains a zero byte
         raise ValueError("an empty name")
     return text
+
+
+def _is_name_or_number(item: object) -> bool:
+    """Return whether a value is a name, a path or an integer."""
+    return isinstance(item, (str, Path, int)) and not isinstance(item, bool)
 
 
 def text_validator(*names: str, several: Sequence[str] = ()) -> Any:

@@ -52,20 +52,31 @@ def find_reachable_address(host: str) -> str:
     """
     if host not in ("0.0.0.0", "::", ""):
         return host
-    # a machine far away; these addresses are for documentation, RFC 3849 and RFC 5737
-    family = socket.AF_INET
-    remote = "192.0.2.1"
-    if host == "::":
-        family = socket.AF_INET6
-        remote = "2001:db8::1"
+    # The second address is of a machine far away; these addresses are for
+    # documentation, RFC 3849 and RFC 5737.
     try:
-        with socket.socket(family, socket.SOCK_DGRAM) as probe:
-            # nothing is sent: the system only chooses the address of this machine from
-            # which it would send, whatever the port
-            probe.connect((remote, 9))
-            return str(probe.getsockname()[0])
+        if host == "::":
+            return _find_sending_address(socket.AF_INET6, "2001:db8::1")
+        return _find_sending_address(socket.AF_INET, "192.0.2.1")
     except OSError:
         return "::1" if host == "::" else "127.0.0.1"
+
+
+def _find_sending_address(family: socket.AddressFamily, remote: str) -> str:
+    """Return the address from which this machine would send to another one.
+
+    Args:
+        family: family of both addresses.
+        remote: address of the other machine.
+
+    Raises:
+        OSError: there is no network.
+    """
+    with socket.socket(family, socket.SOCK_DGRAM) as probe:
+        # nothing is sent: the system only chooses the address of this machine from
+        # which it would send, whatever the port
+        probe.connect((remote, 9))
+        return str(probe.getsockname()[0])
 
 
 @dataclass(eq=False)
@@ -256,9 +267,8 @@ class ConnectionPool:
         Args:
             now: the present time (`time.monotonic`).
         """
-        clients = sorted(
-            self._connections.copy().values(), key=lambda client: client.since
-        )
+        clients = list(self._connections.copy().values())
+        clients.sort(key=lambda client: client.since)  # the slowest first
         n_needed_workers = 0  # as long as a worker is free, none is needed
         if len(clients) == N_WORKERS:
             n_needed_workers = self._ready.qsize()
@@ -285,11 +295,7 @@ class ConnectionPool:
         try:
             connection.setblocking(True)
             if self._context is not None:
-                # The handshake waits for the client. So it is done below, where the
-                # waiting time is measured.
-                connection = self._context.wrap_socket(
-                    connection, server_side=True, do_handshake_on_connect=False
-                )
+                connection = _encrypt_without_handshake(connection, self._context)
             self._connections[thread] = _Connection(connection)
             self.report_waiting(REQUEST_SECONDS)
             if isinstance(connection, ssl.SSLSocket):
@@ -303,6 +309,23 @@ class ConnectionPool:
                 # the plain method: that of an SSL socket would forget that it is one
                 socket.socket.shutdown(connection, socket.SHUT_WR)
             connection.close()
+
+
+def _encrypt_without_handshake(
+    connection: socket.socket, context: ssl.SSLContext
+) -> ssl.SSLSocket:
+    """Return a connection that is encrypted after its handshake.
+
+    The handshake waits for the client. So it is done later, where the waiting time is
+    measured.
+
+    Args:
+        connection: socket of the plain connection, which is not used afterwards.
+        context: TLS context of the server.
+    """
+    return context.wrap_socket(
+        connection, server_side=True, do_handshake_on_connect=False
+    )
 
 
 def _close_silent(

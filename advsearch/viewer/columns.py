@@ -157,11 +157,7 @@ def _read_corners(row: Row, boxes: Boxes) -> Mapping[str, float]:
     if isinstance(payload, dict) and "box" in payload:
         best_box = _find_best_detection(row, payload)
         boxes.add(payload)
-        values = list[float]()
-        for box in (payload["box"], best_box):
-            corners_of_box = box or [None] * 4  # without a box four NaN
-            for corner in corners_of_box:
-                values.append(math.nan if corner is None else float(corner))
+        values = [*_list_corner_values(payload["box"]), *_list_corner_values(best_box)]
         corners = dict(zip(CORNERS, values, strict=True))
     # Every row gets an entry, also one without boxes.
     n_boxes_so_far = len(boxes.values) // VALUES_PER_BOX
@@ -181,6 +177,12 @@ def _find_best_detection(row: Row, payload: Mapping[str, Any]) -> Any:
         if detection["label"] == label:
             return detection["box"]
     return None
+
+
+def _list_corner_values(box: Sequence[float | None] | None) -> list[float]:
+    """Return the four numbers of a box; NaN for a number or a box that does not exist."""
+    numbers = box or [None] * 4
+    return [math.nan if number is None else float(number) for number in numbers]
 
 
 def pack_columns(

@@ -254,9 +254,8 @@ def make_table(
         link = links[row] if row < len(links) else ""
         cells = _make_body_cells(row, texts, link, shares or {})
         if bars:
-            cells.append(
-                make_element("td", _interval_bar(bars[row]), class_="hide-small")
-            )
+            bar = _interval_bar(bars[row])
+            cells.append(make_element("td", bar, class_="hide-small"))
         lines.append(make_element("tr", *cells))
     head = _make_table_head(heads, has_bars=bool(bars))
     return make_scrollable(make_element("table", head, make_element("tbody", *lines)))

@@ -376,6 +376,28 @@ def make_view_page(
         data: scripts that only hold data.
         scripts: names of files with scripts that fill the parts that are `live`.
     """
+    content = _make_page_content(run, result, view)
+    eyebrow = _make_eyebrow(result, view)
+    return document.make_document(
+        f"{run.name}, {result.command}",
+        document.make_header(eyebrow, view.statement, views.list_remarks(result, view)),
+        make_element("main", *content, make_page_end(run, result, view)),
+        data=data,
+        scripts=scripts,
+        footer=f"run {run.name}. This page needs no other file.",
+    )
+
+
+def _make_page_content(
+    run: Path, result: Result, view: ShownResult
+) -> list[Html | None]:
+    """Return the images and parts of a result, and the list of the run's parts.
+
+    Args:
+        run: directory of the run.
+        result: result of the run.
+        view: the parts of the result that are displayed.
+    """
     content = list[Html | None]()
     has_chosen_images = any(
         part.draw or part.figure or part.pictures for part in view.sections
@@ -386,15 +408,7 @@ def make_view_page(
         if part.is_visible_in("page"):
             content.append(make_part(run, part, view.statement))
     content.append(_list_parts(run, list(getattr(result, "parts", ()))))
-    eyebrow = _make_eyebrow(result, view)
-    return document.make_document(
-        f"{run.name}, {result.command}",
-        document.make_header(eyebrow, view.statement, views.list_remarks(result, view)),
-        make_element("main", *content, make_page_end(run, result, view)),
-        data=data,
-        scripts=scripts,
-        footer=f"run {run.name}. This page needs no other file.",
-    )
+    return content
 
 
 def _make_eyebrow(result: Result, view: ShownResult) -> Html:

@@ -156,9 +156,7 @@ def _run_row(name: str, run: listing.ListedRun, can_compare: bool) -> Html:
     subject = _run_subject(name, run, address)
     outcome = join_html(run.state, f": {run.outcome}" if run.outcome else None)
     fault = make_element("div", run.fault, class_="remarks") if run.fault else None
-    start = ""
-    if run.when is not None:
-        start = time.strftime("%Y-%m-%d %H:%M", time.localtime(run.when))
+    start = _format_start_time(run.when)
     cells += [
         make_element("td", _cover_link(run, address)),
         make_element("th", link, subject, scope="row"),
@@ -225,6 +223,17 @@ def is_unfinished(run: Path) -> bool:
     It has none at all, or one of an attack that is being resumed.
     """
     return not (run / REPORT).is_file() or (is_held(run) and listing.can_resume(run))
+
+
+def _format_start_time(when: float | None) -> str:
+    """Return when a run was started, in local time; "" if that is unknown.
+
+    Args:
+        when: seconds since 1970.
+    """
+    if when is None:
+        return ""
+    return time.strftime("%Y-%m-%d %H:%M", time.localtime(when))
 
 
 def make_progress_page(name: str, run: Path) -> str:
@@ -491,9 +500,8 @@ class Dashboard(HTTPServer):
         self.fingerprint = None
         self._context: ssl.SSLContext | None = None
         if https or self.token:
-            self._context, self.fingerprint = make_https_context(
-                (find_reachable_address(host), "localhost", LOOPBACK)
-            )
+            names = (find_reachable_address(host), "localhost", LOOPBACK)
+            self._context, self.fingerprint = make_https_context(names)
         # The socket is bound below, where an error about the address is converted.
         super().__init__((host, port), _Handler, bind_and_activate=False)
         # `finish_request` is the method of `socketserver` that calls `_Handler`.

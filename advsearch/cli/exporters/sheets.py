@@ -48,12 +48,21 @@ class Sheets(Exporter):
             "the first"
         )
         if known_size is None:
-            text += (
-                "\nThe real object's longest side is taken for "
-                f"{exports.format_rounded(longest)} mm; --size says otherwise."
-            )
+            text += _explain_usual_size(exports.format_rounded(longest))
         facts = {"pages": n_pages, "size_mm": longest, "pieces": _list_sizes(pieces)}
         return Exported(facts, text)
+
+
+def _explain_usual_size(longest: str) -> str:
+    """Return a sentence, on a new line, for an object whose size is not known.
+
+    Args:
+        longest: the longest side that is assumed, in millimetres, as text.
+    """
+    return (
+        f"\nThe real object's longest side is taken for {longest} mm; --size says "
+        "otherwise."
+    )
 
 
 def _write_pdf(

@@ -147,11 +147,8 @@ def write_dataset(
     directory.find_run(run)  # raises if there is none, before anything is written
     categories = Categories()
     with writing.name_setting_in_errors("out"):
-        with writing.storage_errors(out):
-            out.parent.mkdir(parents=True, exist_ok=True)
-            temporary = tempfile.TemporaryDirectory(prefix=".export-", dir=out.parent)
-        with temporary:
-            folder = Path(temporary.name) / "dataset"
+        with _make_temporary_folder(out) as temporary:
+            folder = Path(temporary) / "dataset"
             rendered = exports.render_rows(run, every=every, progress=progress)
             n_images, n_changed = _write_files(folder, rendered, categories, format)
             if not n_images:
@@ -160,6 +157,20 @@ def write_dataset(
             with writing.storage_errors(out):
                 os.replace(folder, out)
     return n_images, make_notes(categories, n_changed)
+
+
+def _make_temporary_folder(out: Path) -> tempfile.TemporaryDirectory[str]:
+    """Make a temporary folder next to a dataset, and return its context manager.
+
+    Args:
+        out: folder of the dataset, whose parent is made if it is missing.
+
+    Raises:
+        StorageError: a folder cannot be made.
+    """
+    with writing.storage_errors(out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        return tempfile.TemporaryDirectory(prefix=".export-", dir=out.parent)
 
 
 def _write_files(
