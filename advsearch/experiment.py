@@ -472,15 +472,10 @@ class Experiment(Generic[AnyResult]):
         # only Python callers need it; imports torch
         from advsearch.api.keywords import make_config
 
-        config_values = {
-            name: value
-            for name, value in values.items()
-            if name not in object_names or name in self.positional_args
-        }
+        config_values = self._select_config_values(values, object_names)
         config = make_config(self.settings, **config_values)
         # Objects that settings cannot hold are passed directly to the experiment's
-        # function. A positional setting may be such an object; its name is still stored
-        # in the settings, so it is passed to both.
+        # function.
         arguments = {name: values[name] for name in object_names if name in values}
         return self.run(
             config,
@@ -488,6 +483,23 @@ class Experiment(Generic[AnyResult]):
             resumed_directory=find_stopped_run(config) if resume else None,
             **arguments,
         )
+
+    def _select_config_values(
+        self, values: Mapping[str, Any], object_names: Collection[str]
+    ) -> dict[str, Any]:
+        """Return the arguments that the settings hold.
+
+        A positional setting may be an object; its name is still stored in the settings.
+
+        Args:
+            values: settings, and objects that settings cannot hold, by name.
+            object_names: names of arguments that may be such objects.
+        """
+        return {
+            name: value
+            for name, value in values.items()
+            if name not in object_names or name in self.positional_args
+        }
 
     def _make_signature(
         self, object_parameters: Mapping[str, inspect.Parameter]
@@ -501,7 +513,6 @@ class Experiment(Generic[AnyResult]):
             object_parameters: by name, parameters that take objects and are no settings
                 (`_find_python_arguments`).
         """
-        make = inspect.Parameter
         parameters = [
             self._make_positional_parameter(name) for name in self.positional_args
         ]
@@ -510,15 +521,20 @@ class Experiment(Generic[AnyResult]):
             for name, parameter in object_parameters.items()
             if name not in self.positional_args
         ]
-        if self.resumes_in_python:
-            parameters.append(
-                make("resume", make.KEYWORD_ONLY, default=False, annotation="bool")
-            )
+        parameters += self._make_keyword_parameters()
+        return inspect.Signature(parameters, return_annotation=self.result.__name__)
+
+    def _make_keyword_parameters(self) -> list[inspect.Parameter]:
+        """Return the parameters `resume`, if there is one, `progress` and `**settings`."""
+        make = inspect.Parameter
+        resume = make("resume", make.KEYWORD_ONLY, default=False, annotation="bool")
         progress = make(
             "progress", make.KEYWORD_ONLY, default=None, annotation="ProgressOption"
         )
-        parameters += [progress, make("settings", make.VAR_KEYWORD)]
-        return inspect.Signature(parameters, return_annotation=self.result.__name__)
+        settings = make("settings", make.VAR_KEYWORD)
+        if not self.resumes_in_python:
+            return [progress, settings]
+        return [resume, progress, settings]
 
     def _find_python_arguments(self) -> dict[str, inspect.Parameter]:
         """Return the parameters for objects that only Python callers can pass, by name.

@@ -266,12 +266,20 @@ class Scenes:
         if self.task == "classification":
             one_hot = nn.functional.one_hot(torch.tensor(right_class), len(self.labels))
             return one_hot.float()
+        return self._make_detections(u, right_class)
+
+    def _make_detections(self, u: Tensor, right_class: int) -> Detections:
+        """Return the visible objects in the image of a configuration u (d,).
+
+        Args:
+            u: the configuration.
+            right_class: index of the class of the scene's object.
+        """
         boxes = []
         classes = []
         for thing in find_visible_meshes(self.renderer, u):
-            class_id = (
-                right_class if thing.name == "object" else self._find_class(thing)
-            )
+            is_object = thing.name == "object"
+            class_id = right_class if is_object else self._find_class(thing)
             if class_id is not None:
                 boxes.append(thing.box)
                 classes.append(class_id)

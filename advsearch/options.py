@@ -230,11 +230,7 @@ def _find_expected(option_type: str, value: object) -> str:
         option_type: name of the type, such as "float".
         value: value of the option.
     """
-    is_number = (
-        isinstance(value, (int, float))
-        and not isinstance(value, bool)
-        and abs(value) <= MAX_OPTION  # false for NaN
-    )
+    is_number = _is_number_in_range(value)
     # a float without a fraction, such as 2.0, counts as an int
     is_integral = is_number and value % 1 == 0  # type: ignore[operator]
     if option_type == "float" and not is_number:
@@ -246,6 +242,13 @@ def _find_expected(option_type: str, value: object) -> str:
     if option_type == "str" and not isinstance(value, str):
         return "a text"
     return ""
+
+
+def _is_number_in_range(value: object) -> bool:
+    """Return whether a value is a number whose size is at most `MAX_OPTION`."""
+    if not isinstance(value, (int, float)) or isinstance(value, bool):
+        return False
+    return abs(value) <= MAX_OPTION  # false for NaN
 
 
 def get_option_type(option: Field[Any]) -> str:

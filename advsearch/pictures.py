@@ -171,20 +171,29 @@ def to_8bit_levels(image: Image.Image, *, alpha: bool) -> npt.NDArray[np.uint8]:
     Returns:
         (H, W, 3) uint8, or (H, W, 4) with alpha.
     """
-    levels: npt.NDArray[np.uint8]
-    if image.mode == "F":
-        levels = _convert_gray(image, white=1.0)
-    elif image.mode.startswith("I"):
-        levels = _convert_gray(image, white=65535.0)
-    else:
-        has_transparent_color = "transparency" in image.info
-        mode = "RGBA" if alpha or has_transparent_color else "RGB"
-        levels = np.asarray(image.convert(mode))
+    levels = _convert_to_levels(image, alpha=alpha)
     has_alpha = levels.shape[2] == 4
     if alpha and not has_alpha:
         opaque = np.full_like(levels[:, :, :1], 255)
         levels = np.concatenate([levels, opaque], axis=2)
     return levels if alpha else levels[:, :, :3]
+
+
+def _convert_to_levels(image: Image.Image, *, alpha: bool) -> npt.NDArray[np.uint8]:
+    """Return an image in 8 bits, with three channels, or four if it has an alpha channel.
+
+    Args:
+        image: image of any mode, as `to_8bit_levels` takes it.
+        alpha: whether an alpha channel is made for an image of another mode than gray.
+    """
+    if image.mode == "F":
+        return _convert_gray(image, white=1.0)
+    if image.mode.startswith("I"):
+        return _convert_gray(image, white=65535.0)
+    has_transparent_color = "transparency" in image.info
+    mode = "RGBA" if alpha or has_transparent_color else "RGB"
+    levels: npt.NDArray[np.uint8] = np.asarray(image.convert(mode))
+    return levels
 
 
 def _convert_gray(image: Image.Image, *, white: float) -> npt.NDArray[np.uint8]:
@@ -196,7 +205,8 @@ def _convert_gray(image: Image.Image, *, white: float) -> npt.NDArray[np.uint8]:
     """
     gray = np.nan_to_num(np.asarray(image, np.float32)) / np.float32(white)
     levels = np.round(np.clip(gray, 0.0, 1.0) * 255.0).astype(np.uint8)
-    return levels[:, :, None].repeat(3, axis=2)
+    channels: npt.NDArray[np.uint8] = levels[:, :, None].repeat(3, axis=2)
+    return channels
 
 
 def _count_scans(image: Image.Image) -> int:

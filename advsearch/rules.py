@@ -583,11 +583,7 @@ def shorten_conditions(
     """
     full_score = scorer.score(conditions)
     while len(conditions) > 1:
-        candidates = [
-            conditions[:index] + conditions[index + 1 :]
-            for index in range(len(conditions))
-        ]
-        shorter = max(candidates, key=scorer.score)
+        shorter = max(_list_without_one(conditions), key=scorer.score)
         loss = full_score - scorer.score(shorter)
         tolerated_loss = (1.0 - RETAINED_ACCURACY) * full_score
         # A loss below its standard error may be chance.
@@ -596,6 +592,13 @@ def shorten_conditions(
             break
         conditions = shorter
     return conditions
+
+
+def _list_without_one(conditions: RuleConditions) -> list[RuleConditions]:
+    """Return, for each condition, all others."""
+    return [
+        conditions[:index] + conditions[index + 1 :] for index in range(len(conditions))
+    ]
 
 
 def _estimate_loss_error(
@@ -875,18 +878,34 @@ def walk_tree(
     while open_nodes:
         node, conditions = open_nodes.pop()
         yield conditions
-        left = int(tree.children_left[node])
-        right = int(tree.children_right[node])
-        is_leaf = left == right  # both are -1
-        if is_leaf:
-            continue
-        column = columns[tree.feature[node]]
-        key = column._replace(name=None)  # shared by all names of the factor
-        condition = conditions.get(key, column.full_condition)
-        threshold = float(f"{tree.threshold[node]:.3g}")  # as it is reported
-        below, above = _split_condition(condition, column.name, threshold)
-        open_nodes.append((left, {**conditions, key: below}))
-        open_nodes.append((right, {**conditions, key: above}))
+        open_nodes += _list_child_nodes(tree, columns, node, conditions)
+
+
+def _list_child_nodes(
+    tree: Any,
+    columns: list[TreeColumn],
+    node: int,
+    conditions: dict[TreeColumn, RuleCondition],
+) -> list[tuple[int, dict[TreeColumn, RuleCondition]]]:
+    """Return the two nodes below a node with their conditions; none below a leaf.
+
+    Args:
+        tree: `tree_` of scikit-learn.
+        columns: columns of its data, by index.
+        node: index of the node.
+        conditions: conditions on the path to the node.
+    """
+    left = int(tree.children_left[node])
+    right = int(tree.children_right[node])
+    is_leaf = left == right  # both are -1
+    if is_leaf:
+        return []
+    column = columns[tree.feature[node]]
+    key = column._replace(name=None)  # shared by all names of the factor
+    condition = conditions.get(key, column.full_condition)
+    threshold = float(f"{tree.threshold[node]:.3g}")  # as it is reported
+    below, above = _split_condition(condition, column.name, threshold)
+    return [(left, {**conditions, key: below}), (right, {**conditions, key: above})]
 
 
 def _split_condition(

@@ -223,19 +223,18 @@ def _assert_claim(
     experiment = workbench.get_experiment("test")
     title = f"assert_{claim['claim']}"
     with workbench.hold_process_lock():
-        workbench.allow_code_in_settings(settings)
-        for model in models.values():
-            workbench.allow_code_in_settings({"model": model})
+        _allow_code_of_models(settings, models)
         # the settings with names in place of objects, and the objects by these names
         suite_settings, objects = _name_objects(object, settings)
         claim_settings: dict[str, Any] = dict(claim)
         _name_models(models, suite_settings, claim_settings, objects)
+        claim_name = str(claim["claim"]).replace("_", "-")
         suite = {
             "title": title,
             "settings": suite_settings,
             "seed": seed,
             "confidence": confidence,
-            "claims": {str(claim["claim"]).replace("_", "-"): claim_settings},
+            "claims": {claim_name: claim_settings},
         }
         config = (
             experiment.settings(suite=title, run=None if run is None else str(run))
@@ -243,10 +242,37 @@ def _assert_claim(
             .with_python_objects(objects)
         )
         result: SuiteResult = experiment.run(config, suite=suite)
-    (claim_result,) = result.claims  # the suite has a single claim
+    _check_held(result)
+    return result
+
+
+def _allow_code_of_models(
+    settings: Mapping[str, Any], models: Mapping[str, workbench.AnyModel]
+) -> None:
+    """Allow the code that settings and the names of models refer to.
+
+    Args:
+        settings: settings of a suite.
+        models: models by setting.
+    """
+    # late: torch takes long to import
+    from advsearch.extend import workbench
+
+    workbench.allow_code_in_settings(settings)
+    for model in models.values():
+        workbench.allow_code_in_settings({"model": model})
+
+
+def _check_held(result: SuiteResult) -> None:
+    """Check that the single claim of a suite holds.
+
+    Raises:
+        AssertionError: it is shown to be wrong, or undecided.
+    """
+    __tracebackhide__ = True  # pytest leaves this function out of tracebacks
+    (claim_result,) = result.claims
     if claim_result.verdict != "held":
         raise AssertionError(_format_report(result, claim_result, _describe_repeat()))
-    return result
 
 
 def _name_models(

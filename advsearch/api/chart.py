@@ -82,14 +82,9 @@ def draw_chart_page(title: str, paper: tuple[float, float], convert: Any) -> Fig
         _draw_square(axes, (left + x, top + y), PATCH_SIZE, tuple(color))
     for x, y in CORNER_CENTERS:
         _draw_square(axes, (left + x, top + y), CORNER_SIZE, "black")
-    axes.text(
-        paper[0] - MARGIN,
-        paper[1] - MARGIN,
-        f"{title}: colour chart",
-        fontsize=7,
-        ha="right",
-        va="bottom",
-    )
+    right, bottom = (side - MARGIN for side in paper)
+    heading = f"{title}: colour chart"
+    axes.text(right, bottom, heading, fontsize=7, ha="right", va="bottom")
     return figure
 
 

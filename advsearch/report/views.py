@@ -519,10 +519,8 @@ def make_case_claim(
         statement = f"{name}: the adversarial scene is not confirmed, in {rate_text}."
         return make_claim("measured", statement, extent)
     if found_nothing:
-        statement = (
-            f"{name}: no failure was found; the best configuration counts in "
-            f"{rate_text}. Searched were {spent}. {NO_PROOF}"
-        )
+        best = f"no failure was found; the best configuration counts in {rate_text}"
+        statement = f"{name}: {best}. Searched were {spent}. {NO_PROOF}"
         return make_claim("not found", statement, extent)
     return no_claim
 

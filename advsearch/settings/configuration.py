@@ -504,15 +504,8 @@ class Config(BaseModel):
             value = getattr(self, setting.field)
             effect = setting.power(value)
             if effect:
-                settings_with_effects.append(
-                    OmittedSetting(
-                        name=setting.name,
-                        field=setting.field,
-                        value=value,
-                        effect=effect,
-                        default=setting.default,
-                    )
-                )
+                omitted = _make_omitted_setting(setting, value, effect)
+                settings_with_effects.append(omitted)
         return tuple(settings_with_effects)
 
     @property
@@ -719,6 +712,17 @@ def _check_shallow(config: type[Config], data: Mapping[str, Any]) -> None:
     ]
     if problems:
         raise _make_settings_error(config, problems)
+
+
+def _make_omitted_setting(setting: Setting, value: Any, effect: str) -> OmittedSetting:
+    """Return a setting with its value, and the effect of it outside of the run."""
+    return OmittedSetting(
+        name=setting.name,
+        field=setting.field,
+        value=value,
+        effect=effect,
+        default=setting.default,
+    )
 
 
 def _read_mappings(config: type[Config], data: Mapping[str, Any]) -> dict[str, Any]:

@@ -350,13 +350,33 @@ def _clustered_p_value(
             n_right_inside=copies * float(right_inside.sum()),
             times=copies,
         )
-    # The bets are on wrong predictions inside, and on right ones outside.
+    rates = _compute_bet_rates(right_inside, rows_inside, right_outside, rows_outside)
+    return _betting_p_value(rates, is_cut=is_cut, times=copies)
+
+
+def _compute_bet_rates(
+    right_inside: FloatArray,
+    rows_inside: FloatArray,
+    right_outside: FloatArray,
+    rows_outside: FloatArray,
+) -> FloatArray:
+    """Return the rates (n, 4) of units that `_betting_p_value` takes.
+
+    The bets are on wrong predictions inside, and on right ones outside.
+
+    Args:
+        right_inside: (n,) right predictions of each unit inside.
+        rows_inside: (n,) predictions of each unit inside.
+        right_outside: (n,) right predictions of each unit outside.
+        rows_outside: (n,) predictions of each unit outside.
+    """
     wrong_rate_inside = _divide_or_zero(rows_inside - right_inside, rows_inside)
     right_rate_outside = _divide_or_zero(right_outside, rows_outside)
-    rates = np.stack(
+    has_inside = rows_inside > 0.0
+    has_outside = rows_outside > 0.0
+    return np.stack(
         [wrong_rate_inside, has_inside, right_rate_outside, has_outside], axis=1
     )
-    return _betting_p_value(rates, is_cut=is_cut, times=copies)
 
 
 def _divide_or_zero(numerator: FloatArray, denominator: FloatArray) -> FloatArray:

@@ -24,6 +24,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from advsearch.errors import FileFormatError
 from advsearch.files import JsonObject, JsonValue
 from advsearch.trust.archives import (
     LARGEST_TEXT,
@@ -768,18 +769,32 @@ def _check_pickle(archive: Archive, name: str) -> None:
         f"cannot be read as torch.export ({name!r} would have to be unpickled, which "
         "is never done)",
     )
+    steps = _read_pickle_steps(archive.path, data, refusal)
+    if any(_imports_other(step.name, argument) for step, argument, _position in steps):
+        raise refusal
+
+
+def _read_pickle_steps(path: Path, data: bytes, refusal: FileFormatError) -> list[Any]:
+    """Return the steps of the pickle in a file of `torch.save`, as `pickletools` does.
+
+    Args:
+        path: path of the archive that contains the file, for errors.
+        data: content of the file, itself an archive.
+        refusal: error to raise if it is another file.
+
+    Raises:
+        FileFormatError: it is.
+    """
     is_zip = data[:2] == b"PK"
     if not is_zip:
         raise refusal
-    inner = open_archive(archive.path, io.BytesIO(data), len(data))
+    inner = open_archive(path, io.BytesIO(data), len(data))
     if "data.pkl" not in inner:
         raise refusal
     try:
-        steps = list(pickletools.genops(inner.read_member("data.pkl", LARGEST_TEXT)))
+        return list(pickletools.genops(inner.read_member("data.pkl", LARGEST_TEXT)))
     except (ValueError, IndexError, UnicodeDecodeError):
         raise refusal from None
-    if any(_imports_other(step.name, argument) for step, argument, _position in steps):
-        raise refusal
 
 
 def _imports_other(step_name: str, argument: Any) -> bool:

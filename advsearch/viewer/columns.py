@@ -255,19 +255,32 @@ def _make_layout(
     layout = list[dict[str, object]]()
     offset = 0
     for name, values in arrays:
-        entry: dict[str, object] = {
-            "name": name,
-            "type": values.dtype.name,
-            "at": offset,
-            "width": values.size // max(len(values), 1),
-        }
-        # Rows have different numbers of boxes, so that the length of this column does
-        # not follow from the number of rows.
-        if name == "others":
-            entry["length"] = values.size
-        layout.append(entry)
+        layout.append(_describe_column(name, values, offset))
         offset += values.nbytes
     return layout
+
+
+def _describe_column(
+    name: str, values: npt.NDArray[Any], offset: int
+) -> dict[str, object]:
+    """Return the entry of a column in the layout.
+
+    Args:
+        name: name of the column.
+        values: its values, (n,) or (n, values for each row).
+        offset: bytes of the columns before it.
+    """
+    entry: dict[str, object] = {
+        "name": name,
+        "type": values.dtype.name,
+        "at": offset,
+        "width": values.size // max(len(values), 1),
+    }
+    # Rows have different numbers of boxes, so that the length of this column does not
+    # follow from the number of rows.
+    if name == "others":
+        entry["length"] = values.size
+    return entry
 
 
 def _prediction_columns(

@@ -247,12 +247,6 @@ def make_progress_page(name: str, run: Path) -> str:
         run: directory of the run.
     """
     listed = listing.read_listed_run(run)
-    subjects = (listed.command, listed.object, " and ".join(listed.controls))
-    header = make_element(
-        "header",
-        make_element("p", ", ".join(filter(None, subjects)), class_="eyebrow"),
-        make_element("h1", f"{name} has not ended"),
-    )
     # The script requests rows after a row from this address, relative to the page.
     request = {"progress": "progress", "start": FIRST_ROW_ID}
     main = make_element(
@@ -263,7 +257,7 @@ def make_progress_page(name: str, run: Path) -> str:
     )
     return make_document(
         name,
-        header,
+        _make_progress_header(name, listed),
         main,
         data=[make_data_script(request, "run")],
         scripts=["make.js", "follow.js"],
@@ -297,6 +291,21 @@ def _attack_list_html(run: Path) -> Html | None:
         return None
     return make_element(
         "div", make_element("h2", "Its attacks"), make_element("ul", *attacks)
+    )
+
+
+def _make_progress_header(name: str, run: listing.ListedRun) -> Html:
+    """Return the header of the page that follows the progress of a run.
+
+    Args:
+        name: name of the run in the dashboard.
+        run: state of the run.
+    """
+    subjects = (run.command, run.object, " and ".join(run.controls))
+    return make_element(
+        "header",
+        make_element("p", ", ".join(filter(None, subjects)), class_="eyebrow"),
+        make_element("h1", f"{name} has not ended"),
     )
 
 
@@ -658,18 +667,10 @@ class _Handler(BaseHTTPRequestHandler):
             headers: headers in addition to those of all responses.
         """
         self.send_response(status)
-        for name, value in {
-            "Content-Type": response.media_type,
-            "Content-Length": str(len(response.data)),
-            "Content-Security-Policy": response.policy,
-            "Cache-Control": "no-store",
-            **CLOSED,
-            **headers,
-        }.items():
+        for name, value in {**_make_common_headers(response), **headers}.items():
             self.send_header(name, value)
-        self.server.clients.report_waiting(
-            REQUEST_SECONDS + len(response.data) / MIN_BYTES_PER_SECOND
-        )
+        seconds_to_send = len(response.data) / MIN_BYTES_PER_SECOND
+        self.server.clients.report_waiting(REQUEST_SECONDS + seconds_to_send)
         self.end_headers()
         if self.command != "HEAD":
             self.wfile.write(response.data)
@@ -750,10 +751,7 @@ class _Handler(BaseHTTPRequestHandler):
             case ["runs", name, "rows"]:
                 return self._serve_rows(query, server.find_run(name))
             case ["runs", name, "progress"]:
-                progress = make_progress_json(
-                    server.find_run(name), _parse_after(query)
-                )
-                return Response("application/json", progress)
+                return self._serve_progress(query, server.find_run(name))
             # the page of a part of a study, to which the study's page links
             case ["runs", name, directory.PARTS, part, directory.REPORT]:
                 return self._serve_part(name, part)
@@ -761,19 +759,43 @@ class _Handler(BaseHTTPRequestHandler):
             case ["runs", name, "pictures", folder, file] if THUMBNAIL_PATH.fullmatch(
                 f"{folder}/{file}"
             ):
-                number = int(file.removesuffix(".jpg"))
-                return Response(
-                    "image/jpeg", read_thumbnail(server.find_run(name), number)
-                )
+                return self._serve_thumbnail(name, file)
             case ["runs", name, "align", ""]:
                 return self._serve_photograph_page(name)
             case ["runs", name, "align", ("renderings" | "photos") as folder, file]:
-                kind = folder.removesuffix("s")
-                media_type, data = server.photograph_pages.read_picture(
-                    kind, server.find_run(name), file
-                )
-                return Response(media_type, data)
+                return self._serve_photograph(name, folder.removesuffix("s"), file)
         raise RequestRejected(HTTPStatus.NOT_FOUND, "there is no such page")
+
+    def _serve_progress(self, query: Query, run: Path) -> Response:
+        """Serve the progress of a run since a row that the query names, as JSON."""
+        progress = make_progress_json(run, _parse_after(query))
+        return Response("application/json", progress)
+
+    def _serve_thumbnail(self, name: str, file: str) -> Response:
+        """Serve a small image of a run.
+
+        Args:
+            name: name of the run.
+            file: name of the file, such as "1234.jpg", which has the image's number.
+        """
+        number = int(file.removesuffix(".jpg"))
+        return Response(
+            "image/jpeg", read_thumbnail(self.server.find_run(name), number)
+        )
+
+    def _serve_photograph(self, name: str, kind: str, file: str) -> Response:
+        """Serve a picture for the page that aligns photographs.
+
+        Args:
+            name: name of the run.
+            kind: "rendering" or "photo".
+            file: name of the file.
+        """
+        server = self.server
+        media_type, data = server.photograph_pages.read_picture(
+            kind, server.find_run(name), file
+        )
+        return Response(media_type, data)
 
     def _serve_run(self, name: str) -> Response:
         """Return the page of a run by its name.
@@ -895,6 +917,17 @@ def _check_comparable(runs: Sequence[tuple[str, Path]]) -> None:
             "only sweeps can be shown side by side; "
             f"{', '.join(other_commands)} is none",
         )
+
+
+def _make_common_headers(response: Response) -> dict[str, str]:
+    """Return the headers that every response has."""
+    return {
+        "Content-Type": response.media_type,
+        "Content-Length": str(len(response.data)),
+        "Content-Security-Policy": response.policy,
+        "Cache-Control": "no-store",
+        **CLOSED,
+    }
 
 
 def _parse_after(query: Query) -> int:

@@ -154,16 +154,13 @@ class Thumbnails:
             data = read_thumbnail(self.run, step // self.rows_per_image)
         except OSError:
             return None
-        stream = io.BytesIO()
         try:
-            with Image.open(io.BytesIO(data), formats=("JPEG",)) as image:
-                image.save(stream, "PNG")
+            return _convert_to_png(data)
         except BAD_PICTURE:
             file = thumbnail_path(self.run, step // self.rows_per_image)
             raise FileFormatError(
                 f"{file}: expected a small picture of the run, got something else"
             ) from None
-        return stream.getvalue()
 
     def list_data_urls(
         self, rows: pd.DataFrame, max_bytes: int
@@ -209,6 +206,18 @@ def find_thumbnails(run: Path) -> Thumbnails | None:
     model_names = split_names(str(settings.get("model", "default")))
     is_subset = settings.get("keep_pictures") != "all"
     return Thumbnails(run, len(model_names), is_subset)
+
+
+def _convert_to_png(jpeg: bytes) -> bytes:
+    """Return a JPEG image as a PNG.
+
+    Raises:
+        Exception: one of `BAD_PICTURE` if it is no JPEG.
+    """
+    stream = io.BytesIO()
+    with Image.open(io.BytesIO(jpeg), formats=("JPEG",)) as image:
+        image.save(stream, "PNG")
+    return stream.getvalue()
 
 
 def _list_numbers(run: Path) -> Iterator[int]:
