@@ -813,11 +813,9 @@ def _list_columns_of_factor(
         return [TreeColumn(full_condition, name) for name in names]
     columns = [TreeColumn(full_condition)]
     if unit == "degrees" and np.ptp(values.to_numpy()) >= MIN_ANGLE_RANGE:
-        # modulo `turn` degrees, measured from `zero`
-        columns += [
-            TreeColumn(replace(full_condition, turn=turn), zero=zero)
-            for turn, zero in ARCS
-        ]
+        for turn, zero in ARCS:  # modulo `turn` degrees, measured from `zero`
+            condition = replace(full_condition, turn=turn)
+            columns.append(TreeColumn(condition, zero=zero))
     return columns
 
 

@@ -265,13 +265,7 @@ def _describe_mitsuba_file(file: str, out: Path | None) -> Understood:
     warnings = _load_mitsuba_object(file, contents, out)
     # Shapes that advsearch renders but cannot change, with the reason.
     unchanged_shapes = dict(contents.unchanged)
-    names_by_kind = {
-        "objects": list(contents.objects),
-        # for the text; for JSON it is a mapping, see below
-        "kept": [f"{name} ({reason})" for name, reason in unchanged_shapes.items()],
-        "lights": list(contents.lights),
-        "cameras": list(contents.cameras),
-    }
+    names_by_kind = _name_kinds_of_mitsuba_file(contents, unchanged_shapes)
     lines = [f"{file}: a Mitsuba scene", *_format_names(names_by_kind)]
     lines += _format_object_flags(file, contents.objects)
     lines += [f"Note: {warning}" for warning in warnings]
@@ -281,6 +275,24 @@ def _describe_mitsuba_file(file: str, out: Path | None) -> Understood:
         "warnings": list(warnings),
     }
     return facts, lines
+
+
+def _name_kinds_of_mitsuba_file(
+    contents: PluginContents, unchanged_shapes: Mapping[str, str]
+) -> dict[str, list[str]]:
+    """Return the names in a Mitsuba file by their kind.
+
+    Args:
+        contents: the shapes, lights and cameras in it.
+        unchanged_shapes: shapes that advsearch renders but cannot change, with the
+            reason, which is a part of the text here.
+    """
+    return {
+        "objects": list(contents.objects),
+        "kept": [f"{name} ({reason})" for name, reason in unchanged_shapes.items()],
+        "lights": list(contents.lights),
+        "cameras": list(contents.cameras),
+    }
 
 
 def _format_object_flags(file: str, object_names: Sequence[str]) -> list[str]:
@@ -306,22 +318,28 @@ def _load_mitsuba_object(
     Raises:
         InputError: an image is requested, but no shape can be the object.
     """
-    if contents.objects:
-        object_name = next(
-            (name for name in contents.objects if name not in contents.lights),
-            contents.objects[0],  # if all are lights
-        )
-        scene = advsearch.load_scene(object_name, scene=file)
-        if out is not None:
-            # one view, as large as the four of a mesh file together
-            advsearch.render(scene, resolution=2 * SIDE).save(out)
-        return scene.description.object.warnings
-    if out is not None:
+    if not contents.objects and out is not None:
         raise InputError(
             f"{file}: no shape of it can be the object, so that it cannot "
             "be pictured; leave --out out"
         )
-    return ()
+    if not contents.objects:
+        return ()
+    scene = advsearch.load_scene(_choose_object_shape(contents), scene=file)
+    if out is not None:
+        # one view, as large as the four of a mesh file together
+        advsearch.render(scene, resolution=2 * SIDE).save(out)
+    return scene.description.object.warnings
+
+
+def _choose_object_shape(contents: PluginContents) -> str:
+    """Return the first shape of a Mitsuba file that is no light; the first shape if all
+    are lights.
+    """
+    for name in contents.objects:
+        if name not in contents.lights:
+            return name
+    return contents.objects[0]
 
 
 def _describe(parser: argparse.ArgumentParser) -> None:

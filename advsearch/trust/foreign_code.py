@@ -188,10 +188,7 @@ def use_default_torch_state() -> Iterator[None]:
     computations depend neither on the caller's switches nor on those that foreign code
     sets.
     """
-    leaves_inference_mode: AbstractContextManager[Any] = nullcontext()
-    if torch.is_inference_mode_enabled():
-        leaves_inference_mode = torch.inference_mode(False)
-    with leaves_inference_mode:
+    with _suspend_inference_mode():
         before = TorchState.read_current()
         # `find_expected_torch_state` reads the switches from before the outermost block.
         _outside.append(before)
@@ -203,6 +200,13 @@ def use_default_torch_state() -> Iterator[None]:
             _outside.pop()
             if TorchState.read_current() != before:
                 before.apply()
+
+
+def _suspend_inference_mode() -> AbstractContextManager[Any]:
+    """Return a context in which `torch.inference_mode` is off."""
+    if torch.is_inference_mode_enabled():
+        return torch.inference_mode(False)
+    return nullcontext()
 
 
 def find_expected_torch_state() -> TorchState:

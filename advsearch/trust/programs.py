@@ -55,11 +55,24 @@ def run_converter(
             timeout=longest,
         )
     except subprocess.TimeoutExpired:
-        raise FileFormatError(
-            f"{path}: {program} had not read it after {longest} seconds; export glTF "
-            f"(.glb) from it yourself, or give it longer: {FACTOR}=10 in the "
-            "environment makes all limits ten times as large"
-        ) from None
+        raise _make_converter_timeout_error(path, program, longest) from None
+
+
+def _make_converter_timeout_error(
+    path: Path, program: str, seconds: int
+) -> FileFormatError:
+    """Return the error for a program that takes too long to read a file.
+
+    Args:
+        path: path of the file.
+        program: name of the program.
+        seconds: the time limit.
+    """
+    return FileFormatError(
+        f"{path}: {program} had not read it after {seconds} seconds; export glTF "
+        f"(.glb) from it yourself, or give it longer: {FACTOR}=10 in the environment "
+        "makes all limits ten times as large"
+    )
 
 
 def make_environment(folder: str) -> dict[str, str]:

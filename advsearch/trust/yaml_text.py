@@ -73,6 +73,19 @@ _Loader.add_implicit_resolver(
 )
 
 
+_YAML_ERRORS = (
+    yaml.YAMLError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    OverflowError,
+)
+"""Errors that PyYAML raises. Its constructors raise all of them for values that do not
+fit their tags.
+"""
+
+
 def parse_yaml(text: str) -> Any:
     """Return the value of a YAML text.
 
@@ -88,16 +101,7 @@ def parse_yaml(text: str) -> Any:
         raise ValueError(f"lists or mappings nested deeper than {DEPTH}") from None
     except yaml.MarkedYAMLError as error:
         raise ValueError(_describe_yaml_error(error)) from None
-    except (
-        yaml.YAMLError,
-        ValueError,
-        LookupError,
-        TypeError,
-        AttributeError,
-        OverflowError,
-    ) as error:
-        # The constructors of PyYAML raise all of these for values that do not fit their
-        # tags.
+    except _YAML_ERRORS as error:
         raise ValueError(_shorten(str(error))) from None
 
 

@@ -53,7 +53,6 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
         *describe_formation(renderer, gain, backdrop),
         *describe_omissions(adversarial, hazy=hazy),
     ]
-    hides_environment = backdrop is not None
     with writing.name_setting_in_errors("out"), writing.storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         _write_scene_files(
@@ -61,7 +60,7 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
             renderer.scene,
             scene_inputs,
             notes,
-            hide_environment=hides_environment,
+            hide_environment=backdrop is not None,
         )
         _write_scene_readme(path, adversarial.folder.name, notes)
     return notes
