@@ -364,20 +364,45 @@ def _find_charts(
     positions = raster.compute_positions().astype(np.float64)
     charts = _label_charts(_find_printed_texels(raster, faces))
     for number, (box, inside) in enumerate(charts, 1):
-        size_and_distortion = _measure_texel_size(positions[box] * scale, inside)
-        if size_and_distortion is None:  # a line or a point, which cannot be printed
-            continue
-        texel_size, distortion = size_and_distortion
-        image = _extend_inside(texture[box], inside)
         # A chart whose texture coordinates are mirrored has a negative signed area.
         chart_faces = np.unique(raster.face_index[box][inside])
-        is_mirrored = uv_areas[chart_faces].sum() < 0.0
-        if is_mirrored:  # mirror it back; the size of its texels stays the same
-            image = image[:, ::-1]
-            inside = inside[:, ::-1]
+        is_mirrored = bool(uv_areas[chart_faces].sum() < 0.0)
         chart_name = name if len(charts) == 1 else f"{name}, piece {number}"
-        title = chart_name + _describe_distortion(distortion)
-        yield _make_piece(title, image, texel_size, inside)
+        chart_positions = positions[box] * scale
+        piece = _make_chart_piece(
+            chart_name, texture[box], chart_positions, inside, is_mirrored=is_mirrored
+        )
+        if piece is not None:
+            yield piece
+
+
+def _make_chart_piece(
+    name: str,
+    texture: Float32Array,
+    positions: Float64Array,
+    inside: Mask,
+    *,
+    is_mirrored: bool,
+) -> Piece | None:
+    """Return a chart as a piece; None for a line or a point, which cannot be printed.
+
+    Args:
+        name: name of the chart.
+        texture: (h, w, 3), the image in the box around the chart.
+        positions: (h, w, 3) of its texels, in millimetres.
+        inside: (h, w) bool, the texels of the chart.
+        is_mirrored: whether the chart is mirrored in the texture.
+    """
+    size_and_distortion = _measure_texel_size(positions, inside)
+    if size_and_distortion is None:
+        return None
+    texel_size, distortion = size_and_distortion
+    image = _extend_inside(texture, inside)
+    if is_mirrored:  # mirror it back; the size of its texels stays the same
+        image = image[:, ::-1]
+        inside = inside[:, ::-1]
+    title = name + _describe_distortion(distortion)
+    return _make_piece(title, image, texel_size, inside)
 
 
 def _find_printed_texels(raster: Charts, faces: IntArray | None) -> Mask:

@@ -503,15 +503,10 @@ def _draw_part(axes: Axes, part: PlacedPart, convert: Any) -> None:
         convert: converts colours from sRGB to those of the printer; None leaves them.
     """
     piece = part.piece
-    x0, x1, y0, y1 = part.pixel_bounds
-    bleed_x, bleed_y = piece.bleed
-    pixel_width, pixel_height = piece.pixel_size_mm
-    # Left and right, top and bottom edge in millimetres: `trim` of the part without its
-    # bleed, `outer` with it.
-    trim_x = part.x, part.x + (x1 - x0) * pixel_width
-    trim_y = part.y, part.y + (y1 - y0) * pixel_height
-    outer_x = trim_x[0] - bleed_x * pixel_width, trim_x[1] + bleed_x * pixel_width
-    outer_y = trim_y[0] - bleed_y * pixel_height, trim_y[1] + bleed_y * pixel_height
+    # `trim` are the edges of the part without its bleed, `outer` those with it
+    trim_x, trim_y = _find_trim_edges(part)
+    outer_x = _add_bleed(trim_x, piece.bleed[0] * piece.pixel_size_mm[0])
+    outer_y = _add_bleed(trim_y, piece.bleed[1] * piece.pixel_size_mm[1])
     axes.imshow(
         _cut_out_with_bleed(part, convert),
         # left, right, bottom, top: y grows downwards on the page
@@ -521,8 +516,27 @@ def _draw_part(axes: Axes, part: PlacedPart, convert: Any) -> None:
     )
     _draw_cut_marks(axes, trim_x, trim_y, outer_x, outer_y)
     if piece.cut_mask is not None:
+        x0, x1, y0, y1 = part.pixel_bounds
         _draw_cut_line(axes, part, piece.cut_mask[y0:y1, x0:x1])
     axes.text(part.x, outer_y[0] - MARK_GAP, part.name, fontsize=6, va="bottom")
+
+
+Edges = tuple[float, float]  # left and right, or top and bottom, in millimetres
+
+
+def _find_trim_edges(part: PlacedPart) -> tuple[Edges, Edges]:
+    """Return left and right, and top and bottom edge of a part without its bleed."""
+    x0, x1, y0, y1 = part.pixel_bounds
+    pixel_width, pixel_height = part.piece.pixel_size_mm
+    x_edges = (part.x, part.x + (x1 - x0) * pixel_width)
+    y_edges = (part.y, part.y + (y1 - y0) * pixel_height)
+    return x_edges, y_edges
+
+
+def _add_bleed(edges: Edges, bleed: float) -> Edges:
+    """Return two edges, each moved outwards by the width of the bleed."""
+    first, last = edges
+    return first - bleed, last + bleed
 
 
 def _cut_out_with_bleed(part: PlacedPart, convert: Any) -> Bytes:

@@ -66,9 +66,7 @@ def make_document(
     """
     code = _join_scripts(scripts)
     # By the policy of the page, only scripts with these digests run.
-    digests: list[str] = []
-    if code:
-        digests = [pages.compute_script_digest(code.encode())]
+    digests = [pages.compute_script_digest(code.encode())] if code else []
     policy = pages.make_page_policy(digests, connects=connects)
     head = _make_head(title, f"{policy}; form-action 'self'")
     footer_html = make_element("footer", f"advsearch {__version__}, {footer or title}")
