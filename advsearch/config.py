@@ -89,18 +89,37 @@ def parse_joined_names(value: Any, setting: str, default_name: str) -> Any:
     has_several_names = isinstance(entries, (list, tuple)) and len(entries) > 1
     if not has_several_names:
         return parse_name_with_options(value, setting, default_name)
-    names: list[str] = []
-    options: dict[str, dict[str, Any]] = {}
-    for entry in entries:
-        name, entry_options = _parse_joined_entry(entry, setting, default_name)
-        if not isinstance(name, str) or not name:
-            return value  # it has another form, and is rejected later
-        names.append(name)
-        if entry_options:
-            options[name] = entry_options
+    named_options = _parse_joined_entries(entries, setting, default_name)
+    if named_options is None:
+        return value  # it has another form, and is rejected later
+    names = [name for name, _ in named_options]
+    options = {
+        name: options_of_name
+        for name, options_of_name in named_options
+        if options_of_name
+    }
     joined_options = _distribute_last_options(names, options)
     joined: dict[str, Any] = {**joined_options, "name": TASK_SEPARATOR.join(names)}
     return parse_name_with_options(joined, setting, default_name)
+
+
+def _parse_joined_entries(
+    entries: Sequence[Any], setting: str, default_name: str
+) -> list[tuple[str, dict[str, Any]]] | None:
+    """Return the name of each entry with its options; None if an entry has no name.
+
+    Args:
+        entries: names, names with options, or mappings.
+        setting: name of the setting, for messages.
+        default_name: name for a mapping that has none.
+    """
+    named_options = []
+    for entry in entries:
+        name, options = _parse_joined_entry(entry, setting, default_name)
+        if not isinstance(name, str) or not name:
+            return None
+        named_options.append((name, options))
+    return named_options
 
 
 def _parse_joined_entry(

@@ -355,21 +355,26 @@ def _name_objects(
     from advsearch.extend import workbench
 
     loading = workbench.loading
-    named = dict(settings)
+    named = {**settings, **_name_scene(object)}
     objects: dict[tuple[str, str], Any] = {}
     if isinstance(object, loading.Scene):
-        scene_settings = loading.scene_to_settings(object)
-        named |= {
-            name: value for name, value in scene_settings.items() if value is not None
-        }
         objects["scene", named["object"]] = object
-    else:
-        named["object"] = str(object)
     controls = loading.list_control_instances(named.get("controls", ()))
     if controls:
         objects |= {("control", control.name): control for control in controls}
         named["controls"] = loading.controls_to_settings(named["controls"])
     return named, objects
+
+
+def _name_scene(object: str | Path | workbench.Scene) -> dict[str, Any]:
+    """Return the settings that name a scene, or the name or the file of its object."""
+    # late: torch takes long to import
+    from advsearch.extend import workbench
+
+    if not isinstance(object, workbench.loading.Scene):
+        return {"object": str(object)}
+    settings = workbench.loading.scene_to_settings(object)
+    return {name: value for name, value in settings.items() if value is not None}
 
 
 def _format_report(result: SuiteResult, claim: ClaimResult, repeat: str) -> str:

@@ -258,11 +258,8 @@ class DaskExecutor(WorkerExecutor):
 
         untyped: Any = distributed
         # started once, however often the connection is tried
-        if self._site.start is not None and self._cluster is None:
-            keywords = {} if security is None else {"security": security}
-            self._cluster = self._site.start(**keywords)
-            if self._site.count is not None:
-                self._cluster.scale(self._site.count)
+        if self._cluster is None:
+            self._start_cluster(security)
         seconds_left = min(CONNECT_SECONDS, deadline - time.monotonic())
         return untyped.Client(
             self._cluster or self._site.address,
@@ -270,6 +267,19 @@ class DaskExecutor(WorkerExecutor):
             timeout=max(1.0, seconds_left),
             set_as_default=False,
         )
+
+    def _start_cluster(self, security: Any) -> None:
+        """Start the cluster of the site, if it has one, with its number of workers.
+
+        Args:
+            security: Dask's `Security` with the certificates; None for no encryption.
+        """
+        if self._site.start is None:
+            return
+        keywords = {} if security is None else {"security": security}
+        self._cluster = self._site.start(**keywords)
+        if self._site.count is not None:
+            self._cluster.scale(self._site.count)
 
     # ---- who is there
 
@@ -317,11 +327,7 @@ class DaskExecutor(WorkerExecutor):
         they have the same version of advsearch. Otherwise they are refused, and the
         reason is stored.
         """
-        client = self._client
-        # the keys: `ncores` returns the number of cores of each worker by its address
-        connected = frozenset(
-            client.sync(client.scheduler.ncores, callback_timeout=RESPONSE_SECONDS)
-        )
+        connected = self._read_connected_addresses()
         self.stats.lost += len(self._usable_addresses - connected)
         self._refusal_by_address = {
             address: reason
@@ -333,6 +339,14 @@ class DaskExecutor(WorkerExecutor):
         fit |= self._sort_new_workers(new)
         # A call that ran during these queries may have refused a worker that was fit.
         self._usable_addresses = fit - set(self._refusal_by_address)
+
+    def _read_connected_addresses(self) -> frozenset[str]:
+        """Return the addresses of the workers that the scheduler is connected to."""
+        client = self._client
+        # the keys: `ncores` returns the number of cores of each worker by its address
+        return frozenset(
+            client.sync(client.scheduler.ncores, callback_timeout=RESPONSE_SECONDS)
+        )
 
     def _sort_new_workers(self, new: frozenset[str]) -> frozenset[str]:
         """Return the new workers that have our version of advsearch; refuse the others.

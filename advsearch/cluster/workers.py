@@ -242,18 +242,22 @@ class PoolWorkers:
             raise RuntimeError(f"on {reply.worker}:\n{reply.error}")
         if reply.failure is not None:
             raise ClusterError(reply.error)
-        self.stats.batches += 1
-        self.stats.busy += reply.seconds
-        self.stats.loading += reply.loading_seconds
-        # `compute` adds all seconds for which workers are connected to `alive`. The
-        # seconds of loading are subtracted again.
-        self.stats.alive -= reply.loading_seconds
+        self._count_times(reply)
         machine: str | None = digest_machine(reply.machine)
         if machine == self._this_machine:  # rows of this machine name no machine
             machine = None
         elif machine is not None:
             self._note_machine(machine, reply)
         return BatchResult(items, reply.value, reply.worker, machine)
+
+    def _count_times(self, reply: Reply) -> None:
+        """Add a batch and its times to the statistics of the workers."""
+        self.stats.batches += 1
+        self.stats.busy += reply.seconds
+        self.stats.loading += reply.loading_seconds
+        # `compute` adds all seconds for which workers are connected to `alive`. The
+        # seconds of loading are subtracted again.
+        self.stats.alive -= reply.loading_seconds
 
     def _note_machine(self, machine: str, reply: Reply) -> None:
         """Store and report a machine that differs from this one, at its first reply.

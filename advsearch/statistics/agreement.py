@@ -196,7 +196,7 @@ def estimate_rate(
     return rate, _make_beta_interval(rate * n_effective, n_effective)
 
 
-def _compute_rate_variance(residuals: FloatArray, units: IntArray) -> float:
+def _compute_rate_variance(residuals: npt.ArrayLike, units: IntArray) -> float:
     """Return the variance of a rate over rows that are grouped in units.
 
     The sums of residuals over units are independent, so their squares add up to the

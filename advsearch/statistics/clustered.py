@@ -212,16 +212,14 @@ def compare_paired(
     return second_rate - first_rate, interval, _paired_p_value(unit_advantage)
 
 
-def _compute_advantage(
-    first: npt.NDArray[np.bool_], second: npt.NDArray[np.bool_]
-) -> FloatArray:
+def _compute_advantage(first: Any, second: Any) -> FloatArray:
     """Return the advantage of the second outcome in each row, in [0, 1] for bets.
 
     It is 0 if only the first outcome happens, 1 if only the second does, and 1/2
     otherwise.
 
     Args:
-        first, second: (n,) whether each outcome happens.
+        first, second: (n,) bool, whether each outcome happens.
     """
     advantage: FloatArray = (1.0 + second - 1.0 * first) / 2.0
     return advantage
@@ -374,9 +372,10 @@ def _compute_bet_rates(
     right_rate_outside = _divide_or_zero(right_outside, rows_outside)
     has_inside = rows_inside > 0.0
     has_outside = rows_outside > 0.0
-    return np.stack(
+    rates = np.stack(
         [wrong_rate_inside, has_inside, right_rate_outside, has_outside], axis=1
     )
+    return rates
 
 
 def _divide_or_zero(numerator: FloatArray, denominator: FloatArray) -> FloatArray:

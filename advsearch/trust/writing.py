@@ -295,12 +295,9 @@ class RunLock:
             FileFormatError: the lock is no ordinary file.
         """
         self._path = folder / LOCK
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
         with storage_errors(self._path):
-            self._descriptor = os.open(
-                self._path,
-                os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK,
-                0o644,
-            )
+            self._descriptor = os.open(self._path, flags, 0o644)
         self._check_ordinary_file()
         try:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
