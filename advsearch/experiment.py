@@ -170,12 +170,12 @@ class RunContext(ExitStack, Generic[Settings]):
             fields: other fields by name. `seconds` may have the times of stages; the
                 total is added if it is not among them.
         """
+        shared = self._collect_shared_fields()
         # a total in `fields` replaces this one
         seconds = {
             "total": time.perf_counter() - self._start_time,
             **fields.pop("seconds", {}),
         }
-        shared = self._collect_shared_fields()
         shared |= {
             "run": str(self.run.path),
             "ending": self.ending,
@@ -477,10 +477,11 @@ class Experiment(Generic[AnyResult]):
         # Objects that settings cannot hold are passed directly to the experiment's
         # function.
         arguments = {name: values[name] for name in object_names if name in values}
+        resumed_directory = find_stopped_run(config) if resume else None
         return self.run(
             config,
             progress=as_progress(progress),
-            resumed_directory=find_stopped_run(config) if resume else None,
+            resumed_directory=resumed_directory,
             **arguments,
         )
 

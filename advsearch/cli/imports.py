@@ -326,10 +326,11 @@ def _load_mitsuba_object(
     if not contents.objects:
         return ()
     scene = advsearch.load_scene(_choose_object_shape(contents), scene=file)
+    warnings = scene.description.object.warnings
     if out is not None:
         # one view, as large as the four of a mesh file together
         advsearch.render(scene, resolution=2 * SIDE).save(out)
-    return scene.description.object.warnings
+    return warnings
 
 
 def _choose_object_shape(contents: PluginContents) -> str:

@@ -327,7 +327,8 @@ class DaskExecutor(WorkerExecutor):
         they have the same version of advsearch. Otherwise they are refused, and the
         reason is stored.
         """
-        connected = self._read_connected_addresses()
+        client = self._client
+        connected = _read_connected_addresses(client)
         self.stats.lost += len(self._usable_addresses - connected)
         self._refusal_by_address = {
             address: reason
@@ -336,27 +337,20 @@ class DaskExecutor(WorkerExecutor):
         }
         fit = self._usable_addresses & connected
         new = connected - fit - set(self._refusal_by_address)
-        fit |= self._sort_new_workers(new)
+        fit |= self._sort_new_workers(client, new)
         # A call that ran during these queries may have refused a worker that was fit.
         self._usable_addresses = fit - set(self._refusal_by_address)
 
-    def _read_connected_addresses(self) -> frozenset[str]:
-        """Return the addresses of the workers that the scheduler is connected to."""
-        client = self._client
-        # the keys: `ncores` returns the number of cores of each worker by its address
-        return frozenset(
-            client.sync(client.scheduler.ncores, callback_timeout=RESPONSE_SECONDS)
-        )
-
-    def _sort_new_workers(self, new: frozenset[str]) -> frozenset[str]:
+    def _sort_new_workers(self, client: Any, new: frozenset[str]) -> frozenset[str]:
         """Return the new workers that have our version of advsearch; refuse the others.
 
         Args:
+            client: client of the connection that was used.
             new: addresses of workers.
         """
         if not new:
             return frozenset()
-        versions = self._client.sync(
+        versions = client.sync(
             self._versions, sorted(new), callback_timeout=RESPONSE_SECONDS
         )
         fit = frozenset[str]()
@@ -628,6 +622,18 @@ class DaskExecutor(WorkerExecutor):
                 client.sync(
                     self._forget_files, client, callback_timeout=RESPONSE_SECONDS
                 )
+
+
+def _read_connected_addresses(client: Any) -> frozenset[str]:
+    """Return the addresses of the workers that the scheduler is connected to.
+
+    Args:
+        client: client of the connection to the scheduler.
+    """
+    # the keys: `ncores` returns the number of cores of each worker by its address
+    return frozenset(
+        client.sync(client.scheduler.ncores, callback_timeout=RESPONSE_SECONDS)
+    )
 
 
 def _submit_call(

@@ -86,7 +86,7 @@ def _find_dip(
     right: NDArray[np.int64],
     counts: NDArray[np.int64],
 ) -> Dip | None:
-    """Return the clearest dip at a distance; None if all ranges beyond have lower rates.
+    """Return the clearest dip at a distance; None if no range beyond has a higher rate.
 
     Args:
         near: index of the distance.
@@ -96,9 +96,8 @@ def _find_dip(
     """
     n_distances = len(distances)
     n_comparisons = n_distances * (n_distances - 1) / 2.0
-    # for every range that begins right behind this distance
-    right_beyond = np.cumsum(right[near + 1 :])
-    counts_beyond = np.cumsum(counts[near + 1 :])
+    right_beyond = _sum_ranges_beyond(near, right)
+    counts_beyond = _sum_ranges_beyond(near, counts)
     clearest = _find_clearest_dip(
         right[near], counts[near], right_beyond, counts_beyond
     )
@@ -113,6 +112,24 @@ def _find_dip(
         counts_beyond=(int(right_beyond[best]), int(counts_beyond[best])),
         p_value=min(1.0, p_value * n_comparisons),
     )
+
+
+def _sum_ranges_beyond(near: int, values: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the sum of values over every range that begins right behind a distance.
+
+    Args:
+        near: index of the distance.
+        values: (m,) a value for each distance.
+
+    Returns:
+        (m - near - 1,) sums, by the end of the range, the nearest first.
+    """
+    # sums over the distances before each index
+    sums_before = np.concatenate([[0], np.cumsum(values)])
+    # the index after the last distance of each range
+    end = np.arange(near + 2, len(values) + 1)
+    sums_beyond: NDArray[np.int64] = sums_before[end] - sums_before[near + 1]
+    return sums_beyond
 
 
 def _find_clearest_dip(

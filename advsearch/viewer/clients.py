@@ -52,7 +52,7 @@ def find_reachable_address(host: str) -> str:
     """
     if host not in ("0.0.0.0", "::", ""):
         return host
-    # The second address is of a machine far away; these addresses are for
+    # The remote address is of a machine far away; these addresses are for
     # documentation, RFC 3849 and RFC 5737.
     try:
         if host == "::":
