@@ -86,12 +86,7 @@ if not TYPE_CHECKING:  # otherwise a type checker would accept any name
         module, a function or a class, or an experiment such as "attack".
         """
         if name in _MODULES or name in _HOMES:
-            import_module("advsearch.api")  # sets the threads before torch is imported
-            return (
-                import_module(f"advsearch.{name}")
-                if name in _MODULES
-                else getattr(import_module(_HOMES[name]), name)
-            )
+            return _import_public_name(name)
         if name.isidentifier() and not name.startswith("_") and name in EXPERIMENTS:
             import_module("advsearch.api")
             return get_experiment(name).python
@@ -101,6 +96,14 @@ if not TYPE_CHECKING:  # otherwise a type checker would accept any name
                 "loss='model')"
             )
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def _import_public_name(name: str) -> Any:
+    """Import a public module, or a name in `_HOMES`."""
+    import_module("advsearch.api")  # sets the threads before torch is imported
+    if name in _MODULES:
+        return import_module(f"advsearch.{name}")
+    return getattr(import_module(_HOMES[name]), name)
 
 
 def __dir__() -> list[str]:

@@ -67,25 +67,35 @@ def make_unexpected_error(
         known: names of the function's parameters.
     """
     for name in keywords:
-        if name in known:
-            continue
-        # the keyword that the literature calls so, or why there is none
-        suggestions, reason = suggest_keyword(name, known)
-        # No keyword chooses a device, so a similarly spelled one would be a wrong
-        # suggestion for `device`.
-        chooses_device = name.lower() in DEVICES
-        if not suggestions and not chooses_device:
-            suggestions = find_similar_names(name, known)[:2]
-        hint = ""
-        if suggestions:
-            names = " or ".join(f"`{suggestion}`" for suggestion in suggestions)
-            hint = f"; did you mean {names}?"
-        if reason:
-            hint += f" ({reason})"
-        return TypeError(
-            f"{function}() got an unexpected keyword argument {name!r}{hint}"
-        )
+        if name not in known:
+            hint = _suggest_known_keyword(name, known)
+            return TypeError(
+                f"{function}() got an unexpected keyword argument {name!r}{hint}"
+            )
     return None
+
+
+def _suggest_known_keyword(name: str, known: Sequence[str]) -> str:
+    """Return the end of a message about an unknown keyword: what is probably meant.
+
+    Args:
+        name: the unknown keyword.
+        known: names of the function's parameters.
+    """
+    # the keyword that the literature calls so, or why there is none
+    suggestions, reason = suggest_keyword(name, known)
+    # No keyword chooses a device, so a similarly spelled one would be a wrong
+    # suggestion for `device`.
+    chooses_device = name.lower() in DEVICES
+    if not suggestions and not chooses_device:
+        suggestions = find_similar_names(name, known)[:2]
+    hint = ""
+    if suggestions:
+        names = " or ".join(f"`{suggestion}`" for suggestion in suggestions)
+        hint = f"; did you mean {names}?"
+    if reason:
+        hint += f" ({reason})"
+    return hint
 
 
 def suggest_keyword(name: str, known: Sequence[str]) -> tuple[list[str], str]:
@@ -126,22 +136,39 @@ def check_types(
         is_array = hasattr(value, "tolist")
         if is_array:
             continue
-        type_names = _parse_annotation(str(parameter.annotation))
-        if type_names and not any(_has_type(kind, value) for kind in type_names):
-            words = [
-                # a class by its name, without its module
-                TYPE_WORDS.get(kind, f"a {kind.rpartition('.')[2]}")
-                for kind in type_names
-            ]
-            expected = join_alternatives(words)
-            raise InputError(
-                f"{name}: expected {expected}, got {describe_value(value)}"
-            )
-        if name == "run" and isinstance(value, str) and not value.strip():
-            raise InputError(
-                "run: expected the name of a run or a folder, got an empty text; leave "
-                "it out for no run"
-            )
+        _check_type(name, value, str(parameter.annotation))
+        if name == "run":
+            _check_run_name(value)
+
+
+def _check_run_name(run: object) -> None:
+    """Check that the name of a run is no empty text.
+
+    Raises:
+        InputError: it is.
+    """
+    if isinstance(run, str) and not run.strip():
+        raise InputError(
+            "run: expected the name of a run or a folder, got an empty text; leave "
+            "it out for no run"
+        )
+
+
+def _check_type(name: str, value: object, annotation: str) -> None:
+    """Check that the value of an argument has a type that its annotation allows.
+
+    Raises:
+        InputError: it has another type.
+    """
+    type_names = _parse_annotation(annotation)
+    if type_names and not any(_has_type(kind, value) for kind in type_names):
+        words = [
+            # a class by its name, without its module
+            TYPE_WORDS.get(kind, f"a {kind.rpartition('.')[2]}")
+            for kind in type_names
+        ]
+        expected = join_alternatives(words)
+        raise InputError(f"{name}: expected {expected}, got {describe_value(value)}")
 
 
 def _parse_annotation(annotation: str) -> list[str]:

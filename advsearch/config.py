@@ -52,13 +52,24 @@ def parse_name_with_options(value: Any, setting: str, default_name: str) -> Any:
         value = {"name": name, **options}
     if not isinstance(value, Mapping):
         return value
+    options = _make_paths_absolute(value)
+    name = value.get("name", default_name)
+    return {"name": name, **options} if options else name
+
+
+def _make_paths_absolute(value: Mapping[Any, Any]) -> dict[Any, Any]:
+    """Return the options in a mapping with a name, with absolute paths."""
     options = {key: option for key, option in value.items() if key != "name"}
     for key in PATH_OPTIONS:
         path = options.get(key)
         if isinstance(path, (str, os.PathLike)) and path:
             options[key] = str(Path(path).expanduser().absolute())
-    name = value.get("name", default_name)
-    return {"name": name, **options} if options else name
+    return options
+
+
+def _split_joined_names(text: str) -> list[str]:
+    """Split a text at each + that is not inside of braces."""
+    return re.split(r"\+(?![^{]*\})", text)
 
 
 def parse_joined_names(value: Any, setting: str, default_name: str) -> Any:
@@ -74,28 +85,69 @@ def parse_joined_names(value: Any, setting: str, default_name: str) -> Any:
         setting: name of the setting, for messages.
         default_name: name for a mapping that has none.
     """
-    entries = value
-    if isinstance(value, str):
-        # Split at each + that is not inside of braces.
-        entries = re.split(r"\+(?![^{]*\})", value)
+    entries = _split_joined_names(value) if isinstance(value, str) else value
     has_several_names = isinstance(entries, (list, tuple)) and len(entries) > 1
     if not has_several_names:
         return parse_name_with_options(value, setting, default_name)
-    names = []
-    options: dict[str, dict[str, Any]] = {}
+    named_options = _parse_joined_entries(entries, setting, default_name)
+    if named_options is None:
+        return value  # it has another form, and is rejected later
+    names = [name for name, _ in named_options]
+    options = {
+        name: options_of_name
+        for name, options_of_name in named_options
+        if options_of_name
+    }
+    joined_options = _distribute_last_options(names, options)
+    joined: dict[str, Any] = {**joined_options, "name": TASK_SEPARATOR.join(names)}
+    return parse_name_with_options(joined, setting, default_name)
+
+
+def _parse_joined_entries(
+    entries: Sequence[Any], setting: str, default_name: str
+) -> list[tuple[str, dict[str, Any]]] | None:
+    """Return the name of each entry with its options; None if an entry has no name.
+
+    Args:
+        entries: names, names with options, or mappings.
+        setting: name of the setting, for messages.
+        default_name: name for a mapping that has none.
+    """
+    named_options = []
     for entry in entries:
-        text = entry.strip() if isinstance(entry, str) else entry
-        named = parse_name_with_options(text, setting, default_name)
-        mapping = dict(named) if isinstance(named, Mapping) else {"name": named}
-        name = mapping.pop("name", None)
+        name, options = _parse_joined_entry(entry, setting, default_name)
         if not isinstance(name, str) or not name:
-            return value  # it has another form, and is rejected later
-        names.append(name)
-        if mapping:
-            options[name] = mapping
-    # In stored command lines the options of all names follow the last name, each under
-    # its own name: detection+depth={depth: {seek: gone}}. They belong to all names if
-    # their keys are names; otherwise they are options of the last name only.
+            return None
+        named_options.append((name, options))
+    return named_options
+
+
+def _parse_joined_entry(
+    entry: Any, setting: str, default_name: str
+) -> tuple[Any, dict[Any, Any]]:
+    """Return the name and the options of one of several joined names.
+
+    The arguments are those of `parse_name_with_options`.
+    """
+    text = entry.strip() if isinstance(entry, str) else entry
+    named = parse_name_with_options(text, setting, default_name)
+    mapping = dict(named) if isinstance(named, Mapping) else {"name": named}
+    return mapping.pop("name", None), mapping
+
+
+def _distribute_last_options(
+    names: Sequence[str], options: dict[str, dict[str, Any]]
+) -> dict[str, dict[str, Any]]:
+    """Return the options of each name, some of which may follow the last name.
+
+    In stored command lines the options of all names follow the last name, each under
+    its own name: detection+depth={depth: {seek: gone}}. They belong to all names if
+    their keys are names; otherwise they are options of the last name only.
+
+    Args:
+        names: the joined names.
+        options: options by the name that they follow; this mapping may be changed.
+    """
     last_name = names[-1]
     last_options = options.get(last_name, {})
     is_keyed_by_names = last_options.keys() <= set(names)  # also if there are none
@@ -103,12 +155,9 @@ def parse_joined_names(value: Any, setting: str, default_name: str) -> Any:
         options[last_name] = {}
         options.update(last_options)
     # names without options are left out
-    options = {
+    return {
         name: name_options for name, name_options in options.items() if name_options
     }
-    return parse_name_with_options(
-        {**options, "name": TASK_SEPARATOR.join(names)}, setting, default_name
-    )
 
 
 def has_model_url(model: str) -> bool:
@@ -452,19 +501,23 @@ class SceneConfig(Config):
             names = written.split_names(getattr(self, setting_name) or "")
             needs_model_per_task = setting_name == "model" and len(tasks) > 1
             if needs_model_per_task:
-                if len(names) != len(tasks):
-                    raise InputError(
-                        f"model: expected {len(tasks)} with commas between them, one "
-                        f"for each of {', '.join(tasks)}, got {len(names)}"
-                    )
+                _check_model_per_task(names, tasks)
             elif len(names) > 1 and setting_name not in self.list_settings:
                 raise make_single_value_error(setting_name, names)
+        self._check_size_of_one_object()
+        return self
+
+    def _check_size_of_one_object(self) -> None:
+        """Check that a size is not set for several objects.
+
+        Raises:
+            InputError: it is.
+        """
         if self.size is not None and len(self.objects) > 1:
             raise InputError(
                 "size: is the size of one object, and there are several; leave it out, "
                 "or use `unit`"
             )
-        return self
 
     @property
     def run_name_words(self) -> tuple[str, ...]:
@@ -637,6 +690,19 @@ class SceneConfig(Config):
         }
 
 
+def _check_model_per_task(models: Sequence[str], tasks: Sequence[str]) -> None:
+    """Check that there is one model for each of several tasks.
+
+    Raises:
+        InputError: there are more or fewer.
+    """
+    if len(models) != len(tasks):
+        raise InputError(
+            f"model: expected {len(tasks)} with commas between them, one "
+            f"for each of {', '.join(tasks)}, got {len(models)}"
+        )
+
+
 def make_single_value_error(name: str, names: Sequence[str]) -> InputError:
     """Return the error for several names where one is expected.
 
@@ -795,28 +861,37 @@ class DerivativeConfig(SceneConfig):
             value = _split_epsilons(value)
         if isinstance(value, (list, tuple)) and len(value) == 1:
             value = value[0]
-        if value is None:
-            return value
-        if isinstance(value, Mapping):
-            values = list(value.values())
-        elif isinstance(value, (list, tuple)):
-            values = list(value)
-        else:
-            values = [value]
-        # raises for values out of range
-        numbers = [_parse_positive(number) for number in values]
-        if isinstance(value, (list, tuple)):
-            written.check_no_duplicates(
-                (f"{number:g}" for number in numbers), "epsilon"
-            )
-        if not numbers:  # an empty list or mapping
-            raise ValueError("nothing is named")
+        if value is not None:
+            _check_epsilons(value)
         return value
 
     @property
     def epsilons(self) -> tuple[float, ...]:
         """The epsilons of a curve; empty if `epsilon` is a single value or a mapping."""
         return self.epsilon if isinstance(self.epsilon, tuple) else ()
+
+
+def _check_epsilons(value: Any) -> None:
+    """Check one or several values of `epsilon`.
+
+    Args:
+        value: a single value, a list or tuple, or a mapping by control.
+
+    Raises:
+        ValueError: there is none, one is out of range, or one of a list occurs twice.
+    """
+    if isinstance(value, Mapping):
+        values = list(value.values())
+    elif isinstance(value, (list, tuple)):
+        values = list(value)
+    else:
+        values = [value]
+    # raises for values out of range
+    numbers = [_parse_positive(number) for number in values]
+    if isinstance(value, (list, tuple)):
+        written.check_no_duplicates((f"{number:g}" for number in numbers), "epsilon")
+    if not numbers:  # an empty list or mapping
+        raise ValueError("nothing is named")
 
 
 def _split_epsilons(text: str) -> dict[str, Any] | tuple[str, ...]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 from advsearch.errors import InputError
@@ -42,21 +43,29 @@ class PythonQuantiles(dict[str, object]):
         Raises:
             InputError: the function fails.
         """
-        try:
-            quantiles = [
-                float(f"{float(function(probability)):.6g}")
-                for probability in QUANTILES
-            ]
-        except Exception as error:  # the user's code may raise anything
-            raise InputError(
-                f"distribution {name}: expected a function from a probability to a "
-                "value (an inverse CDF), or an object with such an `icdf` or `ppf`; it "
-                f"raised {type(error).__name__}: {error}"
-            ) from error
+        quantiles = _evaluate_quantiles(name, function)
         super().__init__(
             {DISTRIBUTION: FROM_PYTHON, "name": name, "quantiles": quantiles}
         )
         self.function = function
+
+
+def _evaluate_quantiles(name: str, function: Callable[[float], float]) -> list[float]:
+    """Return the values of an inverse CDF at `QUANTILES`, with six digits.
+
+    Raises:
+        InputError: the function fails; `name` is that of the distribution.
+    """
+    try:
+        return [
+            float(f"{float(function(probability)):.6g}") for probability in QUANTILES
+        ]
+    except Exception as error:  # the user's code may raise anything
+        raise InputError(
+            f"distribution {name}: expected a function from a probability to a "
+            "value (an inverse CDF), or an object with such an `icdf` or `ppf`; it "
+            f"raised {type(error).__name__}: {error}"
+        ) from error
 
 
 def _loc_scale(d: Any) -> dict[str, Any]:
@@ -112,6 +121,38 @@ def distribution_to_setting(value: object) -> object:
     # `dist`.
     family = getattr(value, "dist", value)
     is_frozen = family is not value
+    _check_real_numbers(family, kind)
+    if is_frozen and _is_family_of_scipy(family):
+        return _frozen_to_setting(value)
+    return _inverse_cdf_to_setting(value)
+
+
+def _inverse_cdf_to_setting(value: object) -> object:
+    """Return an object with an inverse CDF, or such a function, as a setting.
+
+    Any other value is returned unchanged.
+    """
+    kind = type(value)
+    inverse_cdf = getattr(value, "icdf", None) or getattr(value, "ppf", None)
+    if inverse_cdf and kind.__module__.startswith("torch"):
+        return PythonQuantiles(kind.__name__, partial(_evaluate_in_torch, inverse_cdf))
+    if inverse_cdf:
+        return PythonQuantiles(kind.__name__, inverse_cdf)
+    if callable(value) and not isinstance(value, type):
+        return PythonQuantiles(str(getattr(value, "__name__", kind.__name__)), value)
+    return value
+
+
+def _check_real_numbers(family: object, kind: type) -> None:
+    """Check that a distribution is not one of integers.
+
+    Args:
+        family: the distribution, or its family in scipy.
+        kind: class of the distribution, for the message.
+
+    Raises:
+        InputError: it is one of integers.
+    """
     # In scipy only distributions of integers have a probability mass function.
     is_of_integers = hasattr(family, "pmf") and hasattr(family, "ppf")
     if is_of_integers:
@@ -120,23 +161,14 @@ def distribution_to_setting(value: object) -> object:
             "real numbers, got one of whole ones; give its values as {choices: [...], "
             "weights: [...]}"
         )
-    if is_frozen and _is_family_of_scipy(family):
-        return _frozen_to_setting(value)
-    inverse_cdf = getattr(value, "icdf", None) or getattr(value, "ppf", None)
-    if inverse_cdf and kind.__module__.startswith("torch"):
-        # This module does not import torch, which is slow. The value is an object of
-        # torch, so it is imported already.
-        torch = sys.modules["torch"]
 
-        def evaluate_inverse_cdf(probability: float) -> float:
-            return float(inverse_cdf(torch.tensor(probability, dtype=torch.float64)))
 
-        return PythonQuantiles(kind.__name__, evaluate_inverse_cdf)
-    if inverse_cdf:
-        return PythonQuantiles(kind.__name__, inverse_cdf)
-    if callable(value) and not isinstance(value, type):
-        return PythonQuantiles(str(getattr(value, "__name__", kind.__name__)), value)
-    return value
+def _evaluate_in_torch(inverse_cdf: Callable[[Any], Any], probability: float) -> float:
+    """Return the value of an inverse CDF that takes and returns tensors of torch."""
+    # This module does not import torch, which is slow. The function belongs to an
+    # object of torch, so it is imported already.
+    torch = sys.modules["torch"]
+    return float(inverse_cdf(torch.tensor(probability, dtype=torch.float64)))
 
 
 def _choices_to_setting(value: Mapping[Any, Any]) -> object:

@@ -122,9 +122,15 @@ def find_similar_names(name: str, known: Iterable[str]) -> list[str]:
             ranks[known_name] = rank
     if ranks:
         return sorted(ranks, key=ranks.__getitem__)
+    return _find_similar_spellings(name, names)
+
+
+def _find_similar_spellings(name: str, known_names: Sequence[str]) -> list[str]:
+    """Return the known names that are spelled like a name, the most similar first."""
     matcher = difflib.SequenceMatcher(None, "", name.casefold())
     similarity_by_name = {
-        known_name: _compute_similarity(matcher, known_name) for known_name in names
+        known_name: _compute_similarity(matcher, known_name)
+        for known_name in known_names
     }
     similar = [name for name, value in similarity_by_name.items() if value > 0.0]
     return sorted(similar, key=similarity_by_name.__getitem__, reverse=True)
@@ -158,14 +164,16 @@ def _rank(query: Sequence[str], words: Sequence[str]) -> tuple[int, int, bool] |
     has_other_end = words[-1] != query[-1]
     if set(query) <= set(words):
         return 0, n_more_words, has_other_end
-    begin_words = all(
-        any(word.startswith(query_word) for word in words) for query_word in query
-    )
-    if begin_words:
+    if all(_begins_any_word(query_word, words) for query_word in query):
         return 1, n_more_words, has_other_end
     if "".join(query) in "".join(words):
         return 2, n_more_words, has_other_end
     return None
+
+
+def _begins_any_word(start: str, words: Sequence[str]) -> bool:
+    """Return whether any word begins with a text."""
+    return any(word.startswith(start) for word in words)
 
 
 def _compute_similarity(matcher: difflib.SequenceMatcher[str], name: str) -> float:
@@ -183,12 +191,16 @@ def _compute_similarity(matcher: difflib.SequenceMatcher[str], name: str) -> flo
     best_ratio = 0.0
     for text, threshold in candidates:
         matcher.set_seq1(text)
-        # The first two are upper bounds of the ratio, and take less time.
-        is_similar = (
-            matcher.real_quick_ratio() >= threshold
-            and matcher.quick_ratio() >= threshold
-            and matcher.ratio() >= threshold
-        )
-        if is_similar:
+        if _reaches_ratio(matcher, threshold):
             best_ratio = max(best_ratio, matcher.ratio())
     return best_ratio
+
+
+def _reaches_ratio(matcher: difflib.SequenceMatcher[str], threshold: float) -> bool:
+    """Return whether two sequences have at least a ratio of similarity."""
+    # The first two are upper bounds of the ratio, and take less time.
+    return (
+        matcher.real_quick_ratio() >= threshold
+        and matcher.quick_ratio() >= threshold
+        and matcher.ratio() >= threshold
+    )

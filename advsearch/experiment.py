@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import inspect
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -170,17 +170,7 @@ class RunContext(ExitStack, Generic[Settings]):
             fields: other fields by name. `seconds` may have the times of stages; the
                 total is added if it is not among them.
         """
-        settings = self.config
-        shared = {
-            name: getattr(settings, attribute)
-            for name, attribute in SHARED_RESULT_FIELDS.items()
-            if hasattr(settings, attribute)
-        }
-        # Results have lists of names; in the settings, objects are a tuple and controls
-        # a mapping by name.
-        for name in ("objects", "controls"):
-            if name in shared:
-                shared[name] = list(shared[name])
+        shared = self._collect_shared_fields()
         # a total in `fields` replaces this one
         seconds = {
             "total": time.perf_counter() - self._start_time,
@@ -190,10 +180,24 @@ class RunContext(ExitStack, Generic[Settings]):
             "run": str(self.run.path),
             "ending": self.ending,
             "seconds": seconds,
-            "command_line": settings.command_line(self.run.path),
-            "python_only": settings.python_only,
+            "command_line": self.config.command_line(self.run.path),
+            "python_only": self.config.python_only,
         }
         return result_type(**{**shared, **fields})
+
+    def _collect_shared_fields(self) -> dict[str, Any]:
+        """Return those fields of a result that are values of the settings."""
+        shared = {
+            name: getattr(self.config, attribute)
+            for name, attribute in SHARED_RESULT_FIELDS.items()
+            if hasattr(self.config, attribute)
+        }
+        # Results have lists of names; in the settings, objects are a tuple and controls
+        # a mapping by name.
+        for name in ("objects", "controls"):
+            if name in shared:
+                shared[name] = list(shared[name])
+        return shared
 
 
 def run_and_save(
@@ -241,17 +245,27 @@ def run_experiment(
     # If the caller passed Python objects, settings have names that need not exist.
     if not config.python_only_parts:
         check_names(dict(config))
-    # An experiment with `out` writes a file or folder of its own, and no run.
-    creates_run = resumed_directory is None and getattr(config, "out", None) is None
-    # The folder of a new run is created before slow imports, so that a run that is
-    # stopped early can be listed. Then the experiment continues in it as in a resumed
-    # run.
-    folder_context: AbstractContextManager[Path | None] = nullcontext(resumed_directory)
-    if creates_run:
-        folder_context = create_before_work(config)
-    with folder_context as folder:
+    with _open_run_folder(config, resumed_directory) as folder:
         experiment: Experiment[Result] = registry.get_experiment(config.command)
         return experiment.run(config, progress=progress, resumed_directory=folder)
+
+
+def _open_run_folder(
+    config: Config, resumed_directory: Path | None
+) -> AbstractContextManager[Path | None]:
+    """Return a context with the folder in which an experiment continues.
+
+    The folder of a new run is created before slow imports, so that a run that is
+    stopped early can be listed. Then the experiment continues in it as in a resumed
+    run.
+
+    Args:
+        config: settings of the experiment.
+        resumed_directory: folder of the run to continue; None for a new run.
+    """
+    # An experiment with `out` writes a file or folder of its own, and no run.
+    creates_run = resumed_directory is None and getattr(config, "out", None) is None
+    return create_before_work(config) if creates_run else nullcontext(resumed_directory)
 
 
 def find_stopped_run(config: Config) -> Path | None:
@@ -418,7 +432,7 @@ class Experiment(Generic[AnyResult]):
         signature that `help` displays for the experiment.
         """
         # only Python callers need it; imports torch
-        from advsearch.api.keywords import make_config, with_settings_signature
+        from advsearch.api.keywords import with_settings_signature
 
         object_parameters = self._find_python_arguments()
 
@@ -426,25 +440,8 @@ class Experiment(Generic[AnyResult]):
             *args: Any, progress: Any = None, resume: bool = False, **settings: Any
         ) -> AnyResult:
             positional = dict(zip(self.positional_args, args, strict=False))
-            values = {**positional, **settings}
-            # Objects that settings cannot hold are passed directly to the experiment's
-            # function. A positional setting may be such an object; its name is still
-            # stored in the settings, so it is passed to both.
-            arguments = {
-                name: values[name] for name in object_parameters if name in values
-            }
-            config_values = {
-                name: value
-                for name, value in values.items()
-                if name not in object_parameters or name in self.positional_args
-            }
-            config = make_config(self.settings, **config_values)
-            resumed = find_stopped_run(config) if resume else None
-            return self.run(
-                config,
-                progress=as_progress(progress),
-                resumed_directory=resumed,
-                **arguments,
+            return self._run_from_python(
+                {**positional, **settings}, object_parameters, progress, resume=resume
             )
 
         # `with_settings_signature` reads the signature, and adds the other settings.
@@ -455,6 +452,55 @@ class Experiment(Generic[AnyResult]):
         function.__doc__ = self.function.__doc__
         function.__module__ = self.function.__module__
         return with_settings_signature(self.settings)(function)
+
+    def _run_from_python(
+        self,
+        values: Mapping[str, Any],
+        object_names: Collection[str],
+        progress: Any,
+        *,
+        resume: bool,
+    ) -> AnyResult:
+        """Run the experiment with the arguments of a Python caller.
+
+        Args:
+            values: settings, and objects that settings cannot hold, by name.
+            object_names: names of arguments that may be such objects.
+            progress: the argument `progress`.
+            resume: whether to continue the run that `run` names.
+        """
+        # only Python callers need it; imports torch
+        from advsearch.api.keywords import make_config
+
+        config_values = self._select_config_values(values, object_names)
+        config = make_config(self.settings, **config_values)
+        # Objects that settings cannot hold are passed directly to the experiment's
+        # function.
+        arguments = {name: values[name] for name in object_names if name in values}
+        resumed_directory = find_stopped_run(config) if resume else None
+        return self.run(
+            config,
+            progress=as_progress(progress),
+            resumed_directory=resumed_directory,
+            **arguments,
+        )
+
+    def _select_config_values(
+        self, values: Mapping[str, Any], object_names: Collection[str]
+    ) -> dict[str, Any]:
+        """Return the arguments that the settings hold.
+
+        A positional setting may be an object; its name is still stored in the settings.
+
+        Args:
+            values: settings, and objects that settings cannot hold, by name.
+            object_names: names of arguments that may be such objects.
+        """
+        return {
+            name: value
+            for name, value in values.items()
+            if name not in object_names or name in self.positional_args
+        }
 
     def _make_signature(
         self, object_parameters: Mapping[str, inspect.Parameter]
@@ -468,7 +514,6 @@ class Experiment(Generic[AnyResult]):
             object_parameters: by name, parameters that take objects and are no settings
                 (`_find_python_arguments`).
         """
-        make = inspect.Parameter
         parameters = [
             self._make_positional_parameter(name) for name in self.positional_args
         ]
@@ -477,17 +522,20 @@ class Experiment(Generic[AnyResult]):
             for name, parameter in object_parameters.items()
             if name not in self.positional_args
         ]
-        if self.resumes_in_python:
-            parameters.append(
-                make("resume", make.KEYWORD_ONLY, default=False, annotation="bool")
-            )
-        parameters.append(
-            make(
-                "progress", make.KEYWORD_ONLY, default=None, annotation="ProgressOption"
-            )
-        )
-        parameters.append(make("settings", make.VAR_KEYWORD))
+        parameters += self._make_keyword_parameters()
         return inspect.Signature(parameters, return_annotation=self.result.__name__)
+
+    def _make_keyword_parameters(self) -> list[inspect.Parameter]:
+        """Return the parameters `resume`, if there is one, `progress` and `**settings`."""
+        make = inspect.Parameter
+        resume = make("resume", make.KEYWORD_ONLY, default=False, annotation="bool")
+        progress = make(
+            "progress", make.KEYWORD_ONLY, default=None, annotation="ProgressOption"
+        )
+        settings = make("settings", make.VAR_KEYWORD)
+        if not self.resumes_in_python:
+            return [progress, settings]
+        return [resume, progress, settings]
 
     def _find_python_arguments(self) -> dict[str, inspect.Parameter]:
         """Return the parameters for objects that only Python callers can pass, by name.

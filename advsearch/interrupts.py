@@ -158,11 +158,16 @@ def _wait_for_second(reading_end: socket.socket, writing_end: socket.socket) -> 
         # one Ctrl-C may come as two signals in a short time
         is_duplicate = now - first_time < DUPLICATE_SECONDS
         if not is_duplicate and not INTERRUPTS.is_work_done:
-            # progress bars hide the cursor of the terminal
-            show_cursor = b"\x1b[?25h" if os.isatty(2) else b""
-            with suppress(OSError):
-                os.write(2, show_cursor + b"advsearch: interrupted\n")
-            os._exit(128 + signal.SIGINT)
+            _end_process()
+
+
+def _end_process() -> None:
+    """Print that there was an interrupt, and end the process at once."""
+    # progress bars hide the cursor of the terminal
+    show_cursor = b"\x1b[?25h" if os.isatty(2) else b""
+    with suppress(OSError):
+        os.write(2, show_cursor + b"advsearch: interrupted\n")
+    os._exit(128 + signal.SIGINT)
 
 
 def report_unraisable_error(unraisable: sys.UnraisableHookArgs) -> None:

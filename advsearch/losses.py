@@ -175,34 +175,74 @@ def check_direction(objective: object, *, targeted: bool) -> None:
             towards the target.
     """
     function = getattr(objective, "func", objective)  # of functools.partial
+    if targeted:
+        _check_not_of_torch(function)
+    for name in __all__:
+        counterpart = f"targeted_{name}"  # the same loss for a target
+        if counterpart in __all__:
+            _check_not_counterpart(function, name, counterpart, targeted=targeted)
+
+
+def _check_not_counterpart(
+    function: object, name: str, counterpart: str, *, targeted: bool
+) -> None:
+    """Check that a function is not the wrong one of two losses.
+
+    Args:
+        function: the function.
+        name: name of the loss for a search without a target.
+        counterpart: name of the same loss for a search with a target.
+        targeted: whether the search has a target.
+
+    Raises:
+        InputError: it is the other one.
+    """
+    if function is globals()[name] and targeted:
+        raise InputError(
+            f"objective: losses.{name} leads away from the `target`; "
+            f"take losses.{counterpart}"
+        )
+    if function is globals()[counterpart] and not targeted:
+        raise InputError(
+            f"objective: losses.{counterpart} needs a `target`; name one, or take "
+            f"losses.{name}"
+        )
+
+
+def _check_not_of_torch(function: object) -> None:
+    """Check that a loss function for a search with a target is none of torch's.
+
+    Raises:
+        InputError: it is one, which falls towards the target.
+    """
     module = str(getattr(function, "__module__", None) or type(function).__module__)
     is_of_torch = module.startswith(
         ("torch.nn.functional", "torch.nn.modules", "torch._C")
     )
-    if targeted and is_of_torch:
+    if is_of_torch:
         name = getattr(function, "__name__", type(function).__name__)
         raise InputError(
             f"objective: it is maximised, and torch's {name} falls towards the "
             "`target`; take losses.targeted_cross_entropy, or negate it: lambda "
             "logits, labels: -loss(logits, labels)"
         )
-    for name in __all__:
-        counterpart = f"targeted_{name}"  # the same loss for a target
-        if counterpart not in __all__:
-            continue
-        if function is globals()[name] and targeted:
-            raise InputError(
-                f"objective: losses.{name} leads away from the `target`; "
-                f"take losses.{counterpart}"
-            )
-        if function is globals()[counterpart] and not targeted:
-            raise InputError(
-                f"objective: losses.{counterpart} needs a `target`; name one, or take "
-                f"losses.{name}"
-            )
 
 
 # ---- parts
+
+
+def _check_label_type(labels: object) -> None:
+    """Check that labels are those of classification: a tensor, or a label set.
+
+    Raises:
+        InputError: they are the truth of another task.
+    """
+    if not isinstance(labels, (Tensor, Sequence)):
+        raise InputError(
+            "labels: expected (N,) int64 or the indices of a label set, got "
+            f"{type(labels).__name__}, the truth of another task than classification; "
+            "a loss of your own takes it as it is"
+        )
 
 
 def _by_label(loss: Callable[..., Tensor], logits: Tensor, labels: Labels) -> Tensor:
@@ -218,20 +258,11 @@ def _by_label(loss: Callable[..., Tensor], logits: Tensor, labels: Labels) -> Te
     Raises:
         InputError: the labels have another type, or do not fit the number of rows.
     """
-    if not isinstance(labels, (Tensor, Sequence)):
-        raise InputError(
-            "labels: expected (N,) int64 or the indices of a label set, got "
-            f"{type(labels).__name__}, the truth of another task than classification; "
-            "a loss of your own takes it as it is"
-        )
+    _check_label_type(labels)
     if not isinstance(labels, Tensor):  # a label set for all rows
         return loss(logits, logits, tuple(labels))
     label_sets = [(int(label),) for label in labels.flatten()]
-    if len(label_sets) not in (1, len(logits)):
-        raise InputError(
-            f"labels: expected {len(logits)}, one for each row of logits, "
-            f"got {len(label_sets)}"
-        )
+    _check_label_count(label_sets, logits)
     if len(set(label_sets)) == 1:  # the same label for all rows
         return loss(logits, logits, label_sets[0])
     row_losses = [
@@ -239,6 +270,19 @@ def _by_label(loss: Callable[..., Tensor], logits: Tensor, labels: Labels) -> Te
         for row, label_set in zip(logits, label_sets, strict=True)
     ]
     return torch.cat(row_losses)
+
+
+def _check_label_count(label_sets: Sequence[object], logits: Tensor) -> None:
+    """Check that there is one label, or one for each row of logits (N, C).
+
+    Raises:
+        InputError: there are more or fewer.
+    """
+    if len(label_sets) not in (1, len(logits)):
+        raise InputError(
+            f"labels: expected {len(logits)}, one for each row of logits, "
+            f"got {len(label_sets)}"
+        )
 
 
 def _to_batch(colors: Tensor) -> Tensor:

@@ -27,7 +27,7 @@ from advsearch.engine.judging import make_domain
 from advsearch.errors import InputError
 from advsearch.models.labels import find_label_set
 from advsearch.scene.color import round_to_8_bit
-from advsearch.scene.outlines import find_visible_meshes
+from advsearch.scene.outlines import VisibleMesh, find_visible_meshes
 from advsearch.tasks import make_task
 
 if TYPE_CHECKING:
@@ -69,19 +69,24 @@ def _to_detections(target: Any) -> dict[str, Tensor]:
 
     It has boxes (n, 4), labels (n,) and scores (n,).
     """
-    scores = torch.as_tensor(target.scores).float()
-    if scores.ndim == 2:  # (n, classes); `labels` has the class with the best score
-        has_classes = scores.shape[1] > 0
-        if has_classes:
-            scores = scores.amax(dim=1)
-        else:  # `amax` would fail
-            scores = scores.new_zeros(len(scores))
+    scores = _get_best_scores(torch.as_tensor(target.scores).float())
     boxes = torch.as_tensor(target.boxes).float().reshape(-1, 4)
     return {
         "boxes": boxes,
         "labels": torch.as_tensor(target.labels).long(),
         "scores": scores,
     }
+
+
+def _get_best_scores(scores: Tensor) -> Tensor:
+    """Return the score (n,) of each detection, from scores (n,) or (n, classes)."""
+    if scores.ndim != 2:
+        return scores
+    # `labels` has the class with the best score
+    has_classes = scores.shape[1] > 0
+    if has_classes:
+        return scores.amax(dim=1)
+    return scores.new_zeros(len(scores))  # `amax` would fail
 
 
 def load_model(
@@ -111,17 +116,10 @@ def load_model(
     Raises:
         InputError: the task is another one.
     """
-    if task not in ("classification", "detection"):
-        raise InputError(
-            "task: expected classification or detection, which MAITE has "
-            f"protocols of, got {task!r}"
-        )
+    _check_task_of_maite(task)
     metadata = getattr(model, "metadata", {})
-    index2label = metadata.get("index2label")
-    if labels is None and index2label:
-        # indices without a label get a placeholder
-        n_labels = max(index2label) + 1
-        labels = [index2label.get(index, f"class {index}") for index in range(n_labels)]
+    if labels is None:
+        labels = _list_class_labels(metadata)
     default_name = str(metadata.get("id", type(model).__name__))
     name = options.pop("name", default_name)
     return models.load_model(
@@ -132,6 +130,18 @@ def load_model(
         name=name,
         **options,
     )
+
+
+def _list_class_labels(metadata: Any) -> list[Any] | None:
+    """Return the names of classes in the metadata of a model by index; None if none.
+
+    Indices without a label get a placeholder.
+    """
+    index2label = metadata.get("index2label")
+    if not index2label:
+        return None
+    n_labels = max(index2label) + 1
+    return [index2label.get(index, f"class {index}") for index in range(n_labels)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,13 +206,7 @@ class Scenes:
         Raises:
             InputError: the task is another one, or `count` is less than 1.
         """
-        if task not in ("classification", "detection"):
-            raise InputError(
-                "task: expected classification or detection, which MAITE "
-                f"has protocols of, got {task!r}"
-            )
-        if count < 1:
-            raise InputError(f"count: expected a whole number from 1, got {count}")
+        _check_scenes_arguments(task, count)
         if not isinstance(scene, loading.Scene):
             scene = loading.load_scene(scene)
         self.renderer = scene.renderer(controls, resolution=resolution, seed=seed)
@@ -218,10 +222,9 @@ class Scenes:
         # The domain has the ranges of all parameters; a configuration is a point in it.
         domain = make_domain(self.space.controls)
         self.configurations = domain.sample(torch.Generator().manual_seed(seed), count)
-        index2label = dict(enumerate(self.labels))
         self.metadata = {
             "id": f"advsearch-{description.object_name}-{seed}",
-            "index2label": index2label,
+            "index2label": dict(enumerate(self.labels)),
         }
 
     def __len__(self) -> int:
@@ -263,14 +266,20 @@ class Scenes:
         if self.task == "classification":
             one_hot = nn.functional.one_hot(torch.tensor(right_class), len(self.labels))
             return one_hot.float()
-        description, _filter = self.renderer.scene.description_and_filter
+        return self._make_detections(u, right_class)
+
+    def _make_detections(self, u: Tensor, right_class: int) -> Detections:
+        """Return the visible objects in the image of a configuration u (d,).
+
+        Args:
+            u: the configuration.
+            right_class: index of the class of the scene's object.
+        """
         boxes = []
         classes = []
         for thing in find_visible_meshes(self.renderer, u):
-            class_id: int | None = right_class
-            if thing.name != "object":  # an additional object of the scene
-                name = description.meshes[thing.name].label or thing.name
-                class_id = _find_class(name, self.labels)
+            is_object = thing.name == "object"
+            class_id = right_class if is_object else self._find_class(thing)
             if class_id is not None:
                 boxes.append(thing.box)
                 classes.append(class_id)
@@ -280,10 +289,38 @@ class Scenes:
             torch.ones(len(boxes)),
         )
 
+    def _find_class(self, thing: VisibleMesh) -> int | None:
+        """Return the class of an additional object of the scene; None if there is none.
 
-def _find_class(name: str, labels: Sequence[str]) -> int | None:
-    """Return the index of the class of a name; None if there is none."""
-    try:
-        return find_label_set(name, labels).indices[0]
-    except InputError:
-        return None
+        Its name is the label of its mesh, or else the name of the mesh.
+        """
+        description, _filter = self.renderer.scene.description_and_filter
+        name = description.meshes[thing.name].label or thing.name
+        try:
+            return find_label_set(name, self.labels).indices[0]
+        except InputError:
+            return None
+
+
+def _check_scenes_arguments(task: str, count: int) -> None:
+    """Check the task and the number of images of a dataset.
+
+    Raises:
+        InputError: the task is another one, or `count` is less than 1.
+    """
+    _check_task_of_maite(task)
+    if count < 1:
+        raise InputError(f"count: expected a whole number from 1, got {count}")
+
+
+def _check_task_of_maite(task: str) -> None:
+    """Check that MAITE has a protocol for a task.
+
+    Raises:
+        InputError: it has none.
+    """
+    if task not in ("classification", "detection"):
+        raise InputError(
+            "task: expected classification or detection, which MAITE has protocols of, "
+            f"got {task!r}"
+        )

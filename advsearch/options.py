@@ -7,7 +7,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, Field, fields
 from enum import Enum
 from pathlib import Path
@@ -44,27 +44,56 @@ def group_mitsuba_keys(controls: Mapping[str, object]) -> dict[str, object]:
     ranges = dict[str, object]()
     for name, options in controls.items():
         kind, colon, key = str(name).partition(":")
-        is_mitsuba_key = kind == MITSUBA_CONTROL and bool(colon)
-        # a control without options has None, {} or ""
-        has_range = options is not None and options not in ({}, "")
-        if not is_mitsuba_key:
-            plain[name] = _with_parameter(str(name), options)
-        elif not key or not has_range:
-            raise InputError(
-                f"`controls` {name}: expected a range, as in "
-                f"{MITSUBA_CONTROL}:{key or 'KEY'}=[0.2, 0.8]"
-            )
-        else:
+        if kind == MITSUBA_CONTROL and colon:
+            _check_mitsuba_range(name, key, options)
             ranges[key] = options
+        else:
+            plain[name] = _with_parameter(str(name), options)
     if not ranges:
         return plain
-    grouped = plain.get(MITSUBA_CONTROL) or {}
+    return {
+        **plain,
+        MITSUBA_CONTROL: _merge_ranges(plain.get(MITSUBA_CONTROL), ranges),
+    }
+
+
+def _merge_ranges(options: object, ranges: Mapping[str, object]) -> dict[str, object]:
+    """Return the options of the control of Mitsuba's parameters with further ranges.
+
+    Args:
+        options: options of the control; None if it has none.
+        ranges: ranges by key of the parameter.
+
+    Raises:
+        InputError: the options are no mapping, or a key has two ranges.
+    """
+    grouped = options or {}
     if not isinstance(grouped, Mapping) or grouped.keys() & ranges.keys():
         raise InputError(
             f"`controls` {MITSUBA_CONTROL}: expected each of Mitsuba's names once, "
             "with a range"
         )
-    return {**plain, MITSUBA_CONTROL: {**grouped, **ranges}}
+    return {**grouped, **ranges}
+
+
+def _check_mitsuba_range(name: str, key: str, options: object) -> None:
+    """Check that a key of Mitsuba's scene parameters is there, and has a range.
+
+    Args:
+        name: the control, "mitsuba:KEY".
+        key: the key.
+        options: the range.
+
+    Raises:
+        InputError: one of them is missing.
+    """
+    # a control without options has None, {} or ""
+    has_range = options is not None and options not in ({}, "")
+    if not key or not has_range:
+        raise InputError(
+            f"`controls` {name}: expected a range, as in "
+            f"{MITSUBA_CONTROL}:{key or 'KEY'}=[0.2, 0.8]"
+        )
 
 
 def _with_parameter(name: str, options: object) -> object:
@@ -95,12 +124,7 @@ def format_things(things: object) -> str | None:
     Raises:
         InputError: the value has another type.
     """
-    if things is None:
-        items: Iterable[object] = []
-    elif isinstance(things, (list, tuple)):
-        items = things
-    else:
-        items = [things]
+    items = _list_items(things)
     if not all(isinstance(item, (str, Mapping)) for item in items):
         raise InputError(
             "things: expected a text such as 'car@12,3.5', a mapping or a list of "
@@ -112,6 +136,15 @@ def format_things(things: object) -> str | None:
     )
     texts = [_make_thing_absolute(part) for part in text.split(";") if part.strip()]
     return "; ".join(texts) or None
+
+
+def _list_items(things: object) -> Sequence[object]:
+    """Return the items of a list, or a single item as a list; for None an empty one."""
+    if things is None:
+        return []
+    if isinstance(things, (list, tuple)):
+        return things
+    return [things]
 
 
 def _make_thing_absolute(thing: str) -> str:
@@ -197,11 +230,7 @@ def _find_expected(option_type: str, value: object) -> str:
         option_type: name of the type, such as "float".
         value: value of the option.
     """
-    is_number = (
-        isinstance(value, (int, float))
-        and not isinstance(value, bool)
-        and abs(value) <= MAX_OPTION  # false for NaN
-    )
+    is_number = _is_number_in_range(value)
     # a float without a fraction, such as 2.0, counts as an int
     is_integral = is_number and value % 1 == 0  # type: ignore[operator]
     if option_type == "float" and not is_number:
@@ -213,6 +242,13 @@ def _find_expected(option_type: str, value: object) -> str:
     if option_type == "str" and not isinstance(value, str):
         return "a text"
     return ""
+
+
+def _is_number_in_range(value: object) -> bool:
+    """Return whether a value is a number whose size is at most `MAX_OPTION`."""
+    if not isinstance(value, (int, float)) or isinstance(value, bool):
+        return False
+    return abs(value) <= MAX_OPTION  # false for NaN
 
 
 def get_option_type(option: Field[Any]) -> str:

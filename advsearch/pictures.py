@@ -87,12 +87,21 @@ def check_decodable(image: Image.Image, path: Path | str) -> None:
             f"{image.format}; convert it"
         )
     if image.format in ("JPEG", "MPO"):
-        n_scans = _count_scans(image)
-        max_scans = scale_limit(MAX_SCANS)  # users may raise the limit
-        if n_scans > max_scans:
-            raise make_size_error(
-                path, f"a JPEG of at most {max_scans} scans", f"{n_scans}"
-            )
+        _check_scan_count(image, path)
+
+
+def _check_scan_count(image: Image.Image, path: Path | str) -> None:
+    """Check that a JPEG does not have too many scans.
+
+    Raises:
+        FileFormatError: it has.
+    """
+    n_scans = _count_scans(image)
+    max_scans = scale_limit(MAX_SCANS)  # users may raise the limit
+    if n_scans > max_scans:
+        raise make_size_error(
+            path, f"a JPEG of at most {max_scans} scans", f"{n_scans}"
+        )
 
 
 @contextlib.contextmanager
@@ -162,23 +171,42 @@ def to_8bit_levels(image: Image.Image, *, alpha: bool) -> npt.NDArray[np.uint8]:
     Returns:
         (H, W, 3) uint8, or (H, W, 4) with alpha.
     """
-    is_float = image.mode == "F"
-    is_16bit = image.mode.startswith("I")
-    levels: npt.NDArray[np.uint8]
-    if is_float or is_16bit:  # gray
-        white = np.float32(1.0 if is_float else 65535.0)
-        gray = np.nan_to_num(np.asarray(image, np.float32)) / white
-        levels = np.round(np.clip(gray, 0.0, 1.0) * 255.0).astype(np.uint8)
-        levels = levels[:, :, None].repeat(3, axis=2)  # three equal channels
-    else:
-        has_transparent_color = "transparency" in image.info
-        mode = "RGBA" if alpha or has_transparent_color else "RGB"
-        levels = np.asarray(image.convert(mode))
+    levels = _convert_to_levels(image, alpha=alpha)
     has_alpha = levels.shape[2] == 4
     if alpha and not has_alpha:
         opaque = np.full_like(levels[:, :, :1], 255)
         levels = np.concatenate([levels, opaque], axis=2)
     return levels if alpha else levels[:, :, :3]
+
+
+def _convert_to_levels(image: Image.Image, *, alpha: bool) -> npt.NDArray[np.uint8]:
+    """Return an image in 8 bits, with three channels, or four if it has an alpha channel.
+
+    Args:
+        image: image of any mode, as `to_8bit_levels` takes it.
+        alpha: whether an alpha channel is made for an image of another mode than gray.
+    """
+    if image.mode == "F":
+        return _convert_gray(image, white=1.0)
+    if image.mode.startswith("I"):
+        return _convert_gray(image, white=65535.0)
+    has_transparent_color = "transparency" in image.info
+    mode = "RGBA" if alpha or has_transparent_color else "RGB"
+    levels: npt.NDArray[np.uint8] = np.asarray(image.convert(mode))
+    return levels
+
+
+def _convert_gray(image: Image.Image, *, white: float) -> npt.NDArray[np.uint8]:
+    """Return a gray image in 8 bits with three equal channels, (H, W, 3).
+
+    Args:
+        image: image with one channel.
+        white: its level of white.
+    """
+    gray = np.nan_to_num(np.asarray(image, np.float32)) / np.float32(white)
+    levels = np.round(np.clip(gray, 0.0, 1.0) * 255.0).astype(np.uint8)
+    channels: npt.NDArray[np.uint8] = levels[:, :, None].repeat(3, axis=2)
+    return channels
 
 
 def _count_scans(image: Image.Image) -> int:

@@ -160,11 +160,22 @@ def open_progress(
         return nullcontext(requested)  # type: ignore[arg-type]
     if requested is False:
         return nullcontext(NullProgress())
-    # Left are True and None. None only displays bars in a terminal: no line in a
-    # notebook, and no lines of text.
+    return _open_display(format_names, everywhere=bool(requested))
+
+
+def _open_display(
+    format_names: Callable[[str], str], *, everywhere: bool
+) -> AbstractContextManager[Progress]:
+    """Return bars in a terminal, or another display elsewhere.
+
+    Args:
+        format_names: function that replaces settings in a text.
+        everywhere: whether to display a line in a notebook, and lines of text on a
+            stream, too.
+    """
     shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
     is_notebook = getattr(shell, "kernel", None) is not None
-    if requested and is_notebook:
+    if everywhere and is_notebook:
         return NotebookProgress(format_names)
     stream = sys.stderr  # None in a process without a terminal or a pipe
     if stream is not None and stream.isatty():
@@ -172,7 +183,7 @@ def open_progress(
         # they are written to the stream inside of it.
         terminal = getattr(stream, "stream", stream)
         return BarProgress(terminal, format_names)
-    if requested and stream is not None:
+    if everywhere and stream is not None:
         return LineProgress(stream, format_names)
     return nullcontext(NullProgress())
 
@@ -285,21 +296,33 @@ class LineProgress:
         done = self._done
         total = self._total
         elapsed = self._clock() - self._stage_started
-        limit = "at most " if self._at_most else ""
         texts = []
         if total is not None:
+            limit = "at most " if self._at_most else ""
             texts.append(f"{done} of {limit}{total}")
         elif done:
             texts.append(f"{done} done")
-        times = _seconds(elapsed)
-        if total and 0 < done < total:
-            # Most stages with an upper bound end long before it. So the remaining time
-            # is only printed after a tenth of the steps.
-            is_unsure = self._at_most and 10 * done < total
-            seconds_left = elapsed / done * (total - done)
-            if not is_unsure:
-                times += f", {limit}{_seconds(seconds_left)} left"
+        times = _seconds(elapsed) + self._format_time_left(elapsed)
         return ", ".join(filter(None, [*texts, times, self._info]))
+
+    def _format_time_left(self, elapsed: float) -> str:
+        """Return the seconds left as the end of a text; "" if they are unknown.
+
+        Args:
+            elapsed: seconds since the beginning of the stage.
+        """
+        done = self._done
+        total = self._total
+        if not total or not 0 < done < total:
+            return ""
+        # Most stages with an upper bound end long before it. So the remaining time is
+        # only printed after a tenth of the steps.
+        is_unsure = self._at_most and 10 * done < total
+        if is_unsure:
+            return ""
+        seconds_left = elapsed / done * (total - done)
+        limit = "at most " if self._at_most else ""
+        return f", {limit}{_seconds(seconds_left)} left"
 
     def _print(self, text: str) -> None:
         print(f"advsearch: {text}", file=self._stream, flush=True)
@@ -402,10 +425,7 @@ class BarProgress:
             hint: what the stage consists of, printed above the bars.
             at_most: whether `total` is an upper bound.
         """
-        if self.bars.tasks:  # the last bar becomes full, whatever its number of steps
-            last_bar = self.bars.tasks[-1]
-            steps = max(last_bar.completed, 1)
-            self.bars.update(last_bar.id, total=steps, completed=steps)
+        self._complete_last_bar()
         # Hide all but the last MAX_BARS - 1, since another bar is added below.
         for bar in self.bars.tasks[: -(MAX_BARS - 1)]:
             self.bars.update(bar.id, visible=False)
@@ -414,6 +434,13 @@ class BarProgress:
         self.bars.add_task(
             escape_text(name + (", at most" if at_most else "")), total=total, info=""
         )
+
+    def _complete_last_bar(self) -> None:
+        """Make the last bar full, whatever its number of steps."""
+        if self.bars.tasks:
+            last_bar = self.bars.tasks[-1]
+            steps = max(last_bar.completed, 1)
+            self.bars.update(last_bar.id, total=steps, completed=steps)
 
     def advance(self, n: int = 1, **info: float | str) -> None:
         """See `Progress.advance`. Before the first stage nothing is displayed."""

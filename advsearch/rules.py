@@ -109,13 +109,10 @@ def make_table(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
     columns = dict[str, pd.Series]()
     units = dict[str, str]()
     for name in names:
-        column = rows[name]
-        has_names = column.dtype == "category"
-        if has_names:
-            # alphabetical, so that the order of the rows does not change the result
-            column = column.cat.set_categories(sorted(column.unique()))
+        column = _sort_categories(rows[name])
         if column.nunique() > 1 and not column.isna().any():
             columns[name] = column
+            has_names = column.dtype == "category"
             units[name] = "" if has_names else rows.attrs["units"][name]
     if "outcome" in rows:
         # If a factor has the name "outcome", its column stays.
@@ -127,6 +124,16 @@ def make_table(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
     )
     table.attrs["units"] = units
     return table
+
+
+def _sort_categories(column: pd.Series) -> pd.Series:
+    """Return a column of names with these in alphabetical order; others unchanged.
+
+    So the order of the rows does not change a result.
+    """
+    if column.dtype != "category":
+        return column
+    return column.cat.set_categories(sorted(column.unique()))
 
 
 def is_in_view(rows: pd.DataFrame) -> Mask:
@@ -184,11 +191,7 @@ def merge_repeats(table: pd.DataFrame) -> pd.DataFrame:
     too.
     """
     factors = list(table.attrs["units"])
-    is_continuous = any(
-        table[name].dtype != "category" and 2 * table[name].nunique() >= len(table)
-        for name in factors
-    )
-    if not is_continuous:
+    if not _has_continuous_factor(table, factors):
         return table
     # Rows with the same values of all factors get the same number.
     configuration = (
@@ -202,6 +205,14 @@ def merge_repeats(table: pd.DataFrame) -> pd.DataFrame:
     merged = table.assign(unit=find_connected(unit_index, configuration))
     merged.attrs = table.attrs
     return merged
+
+
+def _has_continuous_factor(table: pd.DataFrame, factors: Iterable[str]) -> bool:
+    """Return whether a numerical factor has at least half as many values as rows."""
+    return any(
+        table[name].dtype != "category" and 2 * table[name].nunique() >= len(table)
+        for name in factors
+    )
 
 
 def find_connected(first: IntArray, second: IntArray) -> IntArray:
@@ -333,20 +344,25 @@ class RuleCondition:
         if self.options:
             return " or ".join(sorted(self.options))
         is_angle = self.turn > 0.0
-        if is_angle:
-            arcs = [
-                f"from {start % 360:g} to {end % 360:g}" for start, end in self.arcs
-            ]
-            values_text = " or ".join(arcs)
-        else:
-            bounds = []
-            if np.isfinite(self.low):
-                bounds.append(f"over {self.low:g}")
-            if np.isfinite(self.high):
-                bounds.append(f"at most {self.high:g}")
-            values_text = " and ".join(bounds)
+        values_text = self._arcs_text if is_angle else self._bounds_text
         has_unit = self.unit not in ("", "1")  # "1" means a number without a unit
         return f"{values_text} {self.unit}" if has_unit else values_text
+
+    @property
+    def _arcs_text(self) -> str:
+        """The arcs of an angle that fulfil the condition, in degrees, as text."""
+        arcs = [f"from {start % 360:g} to {end % 360:g}" for start, end in self.arcs]
+        return " or ".join(arcs)
+
+    @property
+    def _bounds_text(self) -> str:
+        """The finite bounds of the condition, as text without a unit."""
+        bounds = []
+        if np.isfinite(self.low):
+            bounds.append(f"over {self.low:g}")
+        if np.isfinite(self.high):
+            bounds.append(f"at most {self.high:g}")
+        return " and ".join(bounds)
 
 
 # The conditions of a rule, at most one for each factor. All of them have to hold.
@@ -565,27 +581,43 @@ def shorten_conditions(
     left. The steps end when it exceeds both a fraction of the first score and its own
     standard error.
     """
-    table = scorer.table
     full_score = scorer.score(conditions)
-    variance = float(table["correct"].to_numpy().var())  # of a single row
     while len(conditions) > 1:
-        candidates = [
-            conditions[:index] + conditions[index + 1 :]
-            for index in range(len(conditions))
-        ]
-        shorter = max(candidates, key=scorer.score)
-        is_added = find_covered(shorter, table) & ~find_covered(conditions, table)
-        n_added = int(is_added.sum())
-        # A loss below its standard error may be chance. Every row that is covered in
-        # addition changes the score by the row's wrongness minus the mean, divided by
-        # the number of all rows. The variances of these changes add up.
-        standard_error = math.sqrt(n_added * variance) / len(table)
+        shorter = max(_list_without_one(conditions), key=scorer.score)
         loss = full_score - scorer.score(shorter)
         tolerated_loss = (1.0 - RETAINED_ACCURACY) * full_score
+        # A loss below its standard error may be chance.
+        standard_error = _estimate_loss_error(scorer.table, conditions, shorter)
         if loss > max(tolerated_loss, standard_error):
             break
         conditions = shorter
     return conditions
+
+
+def _list_without_one(conditions: RuleConditions) -> list[RuleConditions]:
+    """Return, for each condition, all others."""
+    return [
+        conditions[:index] + conditions[index + 1 :] for index in range(len(conditions))
+    ]
+
+
+def _estimate_loss_error(
+    table: pd.DataFrame, conditions: RuleConditions, shorter: RuleConditions
+) -> float:
+    """Return the standard error of the loss of score if a condition is removed.
+
+    Every row that is covered in addition changes the score by the row's wrongness minus
+    the mean, divided by the number of all rows. The variances of these changes add up.
+
+    Args:
+        table: table of the rows.
+        conditions: the conditions before.
+        shorter: the conditions without one.
+    """
+    variance = float(table["correct"].to_numpy().var())  # of a single row
+    is_added = find_covered(shorter, table) & ~find_covered(conditions, table)
+    n_added = int(is_added.sum())
+    return math.sqrt(n_added * variance) / len(table)
 
 
 def adjust_bounds(
@@ -623,22 +655,27 @@ def list_adjusted(
     """
     if condition.options is not None:
         return
-    values = table[condition.factor].to_numpy()
-    if condition.turn:
-        values = values % condition.turn  # bounds of an angle are modulo its turn
-    # without the smallest and the largest value, which bound nothing
-    quantiles = np.quantile(values, np.linspace(0, 1, N_BOUNDS + 1)[1:-1])
     # an infinite bound is not changed
     has_low = condition.low > -np.inf
     has_high = condition.high < np.inf
     is_angle = bool(condition.turn)  # its low bound may be over the high one
-    for bound in dict.fromkeys(float(f"{quantile:.3g}") for quantile in quantiles):
+    for bound in _list_bounds(condition, table):
         if bound in (condition.low, condition.high):
             continue
         if has_low and (is_angle or bound < condition.high):
             yield replace(condition, low=bound)
         if has_high and (is_angle or bound > condition.low):
             yield replace(condition, high=bound)
+
+
+def _list_bounds(condition: RuleCondition, table: pd.DataFrame) -> list[float]:
+    """Return quantiles of the factor of a condition, with three digits, as bounds."""
+    values = table[condition.factor].to_numpy()
+    if condition.turn:
+        values = values % condition.turn  # bounds of an angle are modulo its turn
+    # without the smallest and the largest value, which bound nothing
+    quantiles = np.quantile(values, np.linspace(0, 1, N_BOUNDS + 1)[1:-1])
+    return list(dict.fromkeys(float(f"{quantile:.3g}") for quantile in quantiles))
 
 
 # ---- candidates from trees
@@ -755,22 +792,30 @@ def list_columns(table: pd.DataFrame) -> list[TreeColumn]:
     """
     columns = []
     for factor, unit in table.attrs["units"].items():
-        values = table[factor]
-        full_condition = RuleCondition(
-            factor, unit
-        )  # without bounds: all rows fulfil it
-        if values.dtype == "category":
-            names = values.cat.categories.tolist()
-            full_condition = replace(full_condition, options=frozenset(names))
-            columns += [TreeColumn(full_condition, name) for name in names]
-            continue
-        columns.append(TreeColumn(full_condition))
-        if unit == "degrees" and np.ptp(values.to_numpy()) >= MIN_ANGLE_RANGE:
-            # modulo `turn` degrees, measured from `zero`
-            columns += [
-                TreeColumn(replace(full_condition, turn=turn), zero=zero)
-                for turn, zero in ARCS
-            ]
+        columns += _list_columns_of_factor(factor, unit, table[factor])
+    return columns
+
+
+def _list_columns_of_factor(
+    factor: str, unit: str, values: pd.Series
+) -> list[TreeColumn]:
+    """Return the columns of data of one factor.
+
+    Args:
+        factor: its name.
+        unit: its unit.
+        values: its values.
+    """
+    full_condition = RuleCondition(factor, unit)  # without bounds: all rows fulfil it
+    if values.dtype == "category":
+        names = values.cat.categories.tolist()
+        full_condition = replace(full_condition, options=frozenset(names))
+        return [TreeColumn(full_condition, name) for name in names]
+    columns = [TreeColumn(full_condition)]
+    if unit == "degrees" and np.ptp(values.to_numpy()) >= MIN_ANGLE_RANGE:
+        for turn, zero in ARCS:  # modulo `turn` degrees, measured from `zero`
+            condition = replace(full_condition, turn=turn)
+            columns.append(TreeColumn(condition, zero=zero))
     return columns
 
 
@@ -802,9 +847,8 @@ def grow_trees(
     forest = make_forest(
         N_TREES, **limits, max_features=0.6, random_state=random_state
     ).fit(data, is_right)
-    trees = [
-        (estimator.tree_, columns) for estimator in (single_tree, *forest.estimators_)
-    ]
+    estimators = (single_tree, *forest.estimators_)
+    trees = [(estimator.tree_, columns) for estimator in estimators]
     for index, column in enumerate(columns):
         # only a column that is measured from another zero has a `turn`
         if column.full_condition.turn > 0.0:
@@ -832,25 +876,55 @@ def walk_tree(
     while open_nodes:
         node, conditions = open_nodes.pop()
         yield conditions
-        left = int(tree.children_left[node])
-        right = int(tree.children_right[node])
-        is_leaf = left == right  # both are -1
-        if is_leaf:
-            continue
-        column = columns[tree.feature[node]]
-        key = column._replace(name=None)  # shared by all names of the factor
-        condition = conditions.get(key, column.full_condition)
-        # Numbers have neither a name nor options, and factors of names have both.
-        if column.name is None or condition.options is None:
-            threshold = float(f"{tree.threshold[node]:.3g}")  # as it is reported
-            below = replace(condition, high=min(condition.high, threshold))
-            above = replace(condition, low=max(condition.low, threshold))
-        else:
-            # Rows with the name have a 1 in the column and are above the threshold.
-            below = replace(condition, options=condition.options - {column.name})
-            above = replace(condition, options=condition.options & {column.name})
-        open_nodes.append((left, {**conditions, key: below}))
-        open_nodes.append((right, {**conditions, key: above}))
+        open_nodes += _list_child_nodes(tree, columns, node, conditions)
+
+
+def _list_child_nodes(
+    tree: Any,
+    columns: list[TreeColumn],
+    node: int,
+    conditions: dict[TreeColumn, RuleCondition],
+) -> list[tuple[int, dict[TreeColumn, RuleCondition]]]:
+    """Return the two nodes below a node with their conditions; none below a leaf.
+
+    Args:
+        tree: `tree_` of scikit-learn.
+        columns: columns of its data, by index.
+        node: index of the node.
+        conditions: conditions on the path to the node.
+    """
+    left = int(tree.children_left[node])
+    right = int(tree.children_right[node])
+    is_leaf = left == right  # both are -1
+    if is_leaf:
+        return []
+    column = columns[tree.feature[node]]
+    key = column._replace(name=None)  # shared by all names of the factor
+    condition = conditions.get(key, column.full_condition)
+    threshold = float(f"{tree.threshold[node]:.3g}")  # as it is reported
+    below, above = _split_condition(condition, column.name, threshold)
+    return [(left, {**conditions, key: below}), (right, {**conditions, key: above})]
+
+
+def _split_condition(
+    condition: RuleCondition, name: str | None, threshold: float
+) -> tuple[RuleCondition, RuleCondition]:
+    """Return the conditions of the rows below and above a threshold.
+
+    Args:
+        condition: the condition of all rows.
+        name: the name whose column is split; None for a column of numbers.
+        threshold: the threshold of the column.
+    """
+    # Numbers have neither a name nor options, and factors of names have both.
+    if name is None or condition.options is None:
+        below = replace(condition, high=min(condition.high, threshold))
+        above = replace(condition, low=max(condition.low, threshold))
+    else:
+        # Rows with the name have a 1 in the column and are above the threshold.
+        below = replace(condition, options=condition.options - {name})
+        above = replace(condition, options=condition.options & {name})
+    return below, above
 
 
 def import_library(name: str) -> Any:

@@ -223,48 +223,108 @@ def _assert_claim(
     experiment = workbench.get_experiment("test")
     title = f"assert_{claim['claim']}"
     with workbench.hold_process_lock():
-        workbench.allow_code_in_settings(settings)
-        for model in models.values():
-            workbench.allow_code_in_settings({"model": model})
+        _allow_code_of_models(settings, models)
         # the settings with names in place of objects, and the objects by these names
         suite_settings, objects = _name_objects(object, settings)
-        claim_settings = dict(claim)
-        for key, model in models.items():
-            model_name = workbench.get_model_name(model)
-            # "model" is a setting of the suite; "than" belongs to the claim
-            if key == "model":
-                suite_settings[key] = model_name
-            else:
-                claim_settings[key] = model_name
-            if not isinstance(model, (str, Path)):
-                objects["model", model_name] = model
-        # The stored run lists everything that its file cannot name, since it cannot be
-        # repeated from the file: the call itself, and models of this session only.
-        python_only = [
-            workbench.PythonOnly("call", f"of {title}"),
-            *(
-                workbench.PythonOnly("model", workbench.get_model_name(model))
-                for model in models.values()
-                if workbench.is_session_only(model)
-            ),
-        ]
+        claim_settings: dict[str, Any] = dict(claim)
+        _name_models(models, suite_settings, claim_settings, objects)
+        claim_name = str(claim["claim"]).replace("_", "-")
         suite = {
             "title": title,
             "settings": suite_settings,
             "seed": seed,
             "confidence": confidence,
-            "claims": {str(claim["claim"]).replace("_", "-"): claim_settings},
+            "claims": {claim_name: claim_settings},
         }
         config = (
             experiment.settings(suite=title, run=None if run is None else str(run))
-            .with_python_only_parts(python_only)
+            .with_python_only_parts(_list_python_only(title, models))
             .with_python_objects(objects)
         )
         result: SuiteResult = experiment.run(config, suite=suite)
-    (claim_result,) = result.claims  # the suite has a single claim
+    _check_held(result)
+    return result
+
+
+def _allow_code_of_models(
+    settings: Mapping[str, Any], models: Mapping[str, workbench.AnyModel]
+) -> None:
+    """Allow the code that settings and the names of models refer to.
+
+    Args:
+        settings: settings of a suite.
+        models: models by setting.
+    """
+    # late: torch takes long to import
+    from advsearch.extend import workbench
+
+    workbench.allow_code_in_settings(settings)
+    for model in models.values():
+        workbench.allow_code_in_settings({"model": model})
+
+
+def _check_held(result: SuiteResult) -> None:
+    """Check that the single claim of a suite holds.
+
+    Raises:
+        AssertionError: it is shown to be wrong, or undecided.
+    """
+    __tracebackhide__ = True  # pytest leaves this function out of tracebacks
+    (claim_result,) = result.claims
     if claim_result.verdict != "held":
         raise AssertionError(_format_report(result, claim_result, _describe_repeat()))
-    return result
+
+
+def _name_models(
+    models: Mapping[str, workbench.AnyModel],
+    suite_settings: dict[str, Any],
+    claim_settings: dict[str, Any],
+    objects: dict[tuple[str, str], Any],
+) -> None:
+    """Add the names of models to the settings, and the models to the objects.
+
+    Args:
+        models: models by setting.
+        suite_settings: settings of the suite, which gets the name of "model".
+        claim_settings: settings of the claim, which gets that of "than".
+        objects: objects by (role, name); names and files are none.
+    """
+    # late: torch takes long to import
+    from advsearch.extend import workbench
+
+    for key, model in models.items():
+        model_name = workbench.get_model_name(model)
+        if key == "model":
+            suite_settings[key] = model_name
+        else:
+            claim_settings[key] = model_name
+        if not isinstance(model, (str, Path)):
+            objects["model", model_name] = model
+
+
+def _list_python_only(
+    title: str, models: Mapping[str, workbench.AnyModel]
+) -> list[workbench.PythonOnly]:
+    """Return everything of a call that the file of its run cannot name.
+
+    The run cannot be repeated from the file: the call itself, and models of this
+    session only.
+
+    Args:
+        title: name of the called function.
+        models: its models by setting.
+    """
+    # late: torch takes long to import
+    from advsearch.extend import workbench
+
+    return [
+        workbench.PythonOnly("call", f"of {title}"),
+        *(
+            workbench.PythonOnly("model", workbench.get_model_name(model))
+            for model in models.values()
+            if workbench.is_session_only(model)
+        ),
+    ]
 
 
 def _describe_repeat() -> str:
@@ -295,21 +355,26 @@ def _name_objects(
     from advsearch.extend import workbench
 
     loading = workbench.loading
-    named = dict(settings)
+    named = {**settings, **_name_scene(object)}
     objects: dict[tuple[str, str], Any] = {}
     if isinstance(object, loading.Scene):
-        scene_settings = loading.scene_to_settings(object)
-        named |= {
-            name: value for name, value in scene_settings.items() if value is not None
-        }
         objects["scene", named["object"]] = object
-    else:
-        named["object"] = str(object)
     controls = loading.list_control_instances(named.get("controls", ()))
     if controls:
         objects |= {("control", control.name): control for control in controls}
         named["controls"] = loading.controls_to_settings(named["controls"])
     return named, objects
+
+
+def _name_scene(object: str | Path | workbench.Scene) -> dict[str, Any]:
+    """Return the settings that name a scene, or the name or the file of its object."""
+    # late: torch takes long to import
+    from advsearch.extend import workbench
+
+    if not isinstance(object, workbench.loading.Scene):
+        return {"object": str(object)}
+    settings = workbench.loading.scene_to_settings(object)
+    return {name: value for name, value in settings.items() if value is not None}
 
 
 def _format_report(result: SuiteResult, claim: ClaimResult, repeat: str) -> str:

@@ -19,6 +19,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from advsearch.errors import InputError
 
@@ -110,15 +111,20 @@ def configure(threads: int | None = None, *, rendering: bool = True) -> int:
     for_torch = _chosen
     if rendering:
         for_torch = max(1, _chosen // 2)
-    if "torch" in sys.modules:
-        sys.modules["torch"].set_num_threads(for_torch)
-    else:
-        # Torch reads the variable when it is imported. It is only set before that,
-        # because child processes inherit it.
-        os.environ["OMP_NUM_THREADS"] = str(for_torch)
+    _set_torch_threads(for_torch)
     if "drjit" in sys.modules:
         apply_to_drjit()
     return _chosen
+
+
+def _set_torch_threads(count: int) -> None:
+    """Set the number of torch's threads, now or for when it is imported."""
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(count)
+    else:
+        # Torch reads the variable when it is imported. It is only set before that,
+        # because child processes inherit it.
+        os.environ["OMP_NUM_THREADS"] = str(count)
 
 
 @contextmanager
@@ -140,11 +146,21 @@ def restore_threads() -> Iterator[None]:
         _chosen = chosen_before
         if "torch" in sys.modules:
             sys.modules["torch"].set_num_threads(torch_threads or _get_default())
-        if drjit is not None:
-            if drjit.thread_count() != drjit_threads:
-                drjit.set_thread_count(drjit_threads)
-        elif "drjit" in sys.modules:  # imported inside of the block
-            apply_to_drjit()
+        _restore_drjit_threads(drjit, drjit_threads)
+
+
+def _restore_drjit_threads(drjit: Any, n_threads: int | None) -> None:
+    """Give Dr.Jit the number of threads that it had.
+
+    Args:
+        drjit: the module; None if it was not imported then.
+        n_threads: the number of threads; None if it was not imported.
+    """
+    if drjit is not None:
+        if drjit.thread_count() != n_threads:
+            drjit.set_thread_count(n_threads)
+    elif "drjit" in sys.modules:  # imported meanwhile
+        apply_to_drjit()
 
 
 @contextmanager

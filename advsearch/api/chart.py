@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from PIL import Image, ImageCms
@@ -75,33 +77,40 @@ def draw_chart_page(title: str, paper: tuple[float, float], convert: Any) -> Fig
     # upper left corner of the patches, on the page
     left = (paper[0] - CHART_SIZE[0]) / 2.0
     top = MARGIN + 2.0 * CORNER_SIZE
+    colors = _convert_chart_colors(convert)
+    for (x, y), color in zip(PATCH_CENTERS, colors, strict=True):
+        _draw_square(axes, (left + x, top + y), PATCH_SIZE, tuple(color))
+    for x, y in CORNER_CENTERS:
+        _draw_square(axes, (left + x, top + y), CORNER_SIZE, "black")
+    right, bottom = (side - MARGIN for side in paper)
+    heading = f"{title}: colour chart"
+    axes.text(right, bottom, heading, fontsize=7, ha="right", va="bottom")
+    return figure
 
-    def draw_square(x: float, y: float, size: float, color: object) -> None:
-        """Draw a square around a center, in millimetres from that corner."""
-        corner = (left + x - size / 2, top + y - size / 2)
-        axes.add_patch(
-            Rectangle(
-                corner, size, size, facecolor=color, linewidth=0.0, antialiased=False
-            )
-        )
 
+def _convert_chart_colors(convert: Any) -> Floats:
+    """Return the colors of the chart, (125, 3) in [0, 1], as the printer gets them.
+
+    Args:
+        convert: color transform of PIL to the printer's profile; None to leave the
+            colors as they are.
+    """
     # an image with one row of pixels, since PIL converts images only
     colors = Image.fromarray(np.round(255.0 * CHART_COLORS[None]).astype(np.uint8))
     printed = colors if convert is None else ImageCms.applyTransform(colors, convert)
-    levels = np.asarray(printed)[0] / 255.0
-    for (x, y), color in zip(PATCH_CENTERS, levels, strict=True):
-        draw_square(x, y, PATCH_SIZE, tuple(color))
-    for x, y in CORNER_CENTERS:
-        draw_square(x, y, CORNER_SIZE, "black")
-    axes.text(
-        paper[0] - MARGIN,
-        paper[1] - MARGIN,
-        f"{title}: colour chart",
-        fontsize=7,
-        ha="right",
-        va="bottom",
+    levels: Floats = np.asarray(printed)[0] / 255.0
+    return levels
+
+
+def _draw_square(
+    axes: Axes, center: tuple[float, float], size: float, color: Any
+) -> None:
+    """Draw a square around a center (x, y), in millimetres on the page."""
+    x, y = center
+    corner = (x - size / 2, y - size / 2)
+    axes.add_patch(
+        Rectangle(corner, size, size, facecolor=color, linewidth=0.0, antialiased=False)
     )
-    return figure
 
 
 @with_checked_arguments
@@ -126,29 +135,53 @@ def measured_palette(photograph: str | Path) -> Tensor:
     )
     corner_pixels = _find_corners(light, photograph)
     homography = _compute_homography(CORNER_CENTERS, corner_pixels)
+    aligned = _AlignedPhotograph(light, homography)
+    colors = [aligned.measure_patch(center) for center in PATCH_CENTERS]
+    return torch.from_numpy(linear_to_srgb(np.array(colors, np.float32)))
 
-    def measure_light(points: Floats) -> Floats:
-        """Return the median light (3,) at points (N, 2) of the chart in millimetres."""
-        median: Floats = np.median(_sample(light, homography, points), axis=0)
-        return median
 
-    # 7 x 7 points around the center of a patch, away from its edges, in millimetres
-    patch_offsets = _make_grid(np.linspace(-0.25, 0.25, 7) * PATCH_SIZE)
-    # The bare paper nearest to a patch is where the gaps between patches cross: at its
-    # four corners. The light is measured at 3 x 3 points of each crossing.
-    gap_crossings = _make_grid((-PITCH / 2.0, PITCH / 2.0))
-    paper_offsets = _make_grid(np.linspace(-0.3, 0.3, 3) * (PITCH - PATCH_SIZE))
-    colors = []
-    for center in PATCH_CENTERS:
-        patch_light = measure_light(center + patch_offsets)
+@dataclass(frozen=True, eq=False)
+class _AlignedPhotograph:
+    """A photograph of the chart, in which points of the chart can be found.
+
+    Attributes:
+        light: (H, W, 3), linear.
+        homography: (3, 3), from the chart in millimetres to pixels.
+    """
+
+    light: Floats
+    homography: Floats
+
+    def measure_patch(self, center: Floats) -> Floats:
+        """Return the light (3,) of a patch, relative to the paper around it.
+
+        Uneven light cancels out by that.
+
+        Args:
+            center: (2,), its center in millimetres.
+        """
+        # 7 x 7 points around the center of a patch, away from its edges
+        patch_offsets = _make_grid(np.linspace(-0.25, 0.25, 7) * PATCH_SIZE)
+        # The bare paper nearest to a patch is where the gaps between patches cross: at
+        # its four corners. The light is measured at 3 x 3 points of each crossing.
+        gap_crossings = _make_grid((-PITCH / 2.0, PITCH / 2.0))
+        paper_offsets = _make_grid(np.linspace(-0.3, 0.3, 3) * (PITCH - PATCH_SIZE))
+        patch_light = self._measure_light(center + patch_offsets)
         paper_light = [
-            measure_light(center + crossing + paper_offsets)
+            self._measure_light(center + crossing + paper_offsets)
             for crossing in gap_crossings
         ]
-        # The light is divided by that of the paper around the patch, so that uneven
-        # light cancels out. 1e-4 prevents a division by zero.
-        colors.append(patch_light / np.maximum(np.mean(paper_light, axis=0), 1e-4))
-    return torch.from_numpy(linear_to_srgb(np.array(colors, np.float32)))
+        # 1e-4 prevents a division by zero
+        relative_light: Floats = patch_light / np.maximum(
+            np.mean(paper_light, axis=0), 1e-4
+        )
+        return relative_light
+
+    def _measure_light(self, points: Floats) -> Floats:
+        """Return the median light (3,) at points (N, 2) in millimetres."""
+        samples = _sample(self.light, self.homography, points)
+        median: Floats = np.median(samples, axis=0)
+        return median
 
 
 def _make_grid(coordinates: Iterable[float]) -> Floats:
@@ -174,29 +207,45 @@ def _find_corners(light: Floats, photograph: str | Path) -> Floats:
     Raises:
         InputError: the squares are not found.
     """
-    not_found = InputError(
-        f"{photograph}: expected a photograph of the whole colour chart, upright, with "
-        "its four black squares, got one in which they are not found; leave nothing "
-        "dark around the sheet"
-    )
     squares = _find_dark_squares(light)
     if len(squares) < 4:
-        raise not_found
+        raise _make_not_found_error(photograph)
     x, y, area = np.array(squares).T
-    # Indices of the square nearest to each corner of the image, in reading order: the
-    # upper left one has the smallest x + y, the upper right one the smallest y - x.
-    outermost = [
-        int(np.argmin(x_sign * x + y_sign * y))
-        for y_sign, x_sign in itertools.product((1, -1), repeat=2)
-    ]
+    outermost = _find_outermost(x, y)
     are_four = len({*outermost}) == 4
     # The squares have the same size on paper. In perspective their areas may differ,
     # but by no more than a factor of 3.
     areas = area[outermost]
     are_similar = areas.max() <= 3.0 * areas.min()
     if not are_four or not are_similar:
-        raise not_found
+        raise _make_not_found_error(photograph)
     return np.stack([x, y], axis=1)[outermost]
+
+
+def _find_outermost(x: Floats, y: Floats) -> list[int]:
+    """Return the indices of the points nearest to the corners of the image.
+
+    Args:
+        x: (N,), in pixels.
+        y: (N,), in pixels.
+
+    Returns:
+        Four indices in reading order: the upper left point has the smallest x + y, the
+        upper right one the smallest y - x.
+    """
+    return [
+        int(np.argmin(x_sign * x + y_sign * y))
+        for y_sign, x_sign in itertools.product((1, -1), repeat=2)
+    ]
+
+
+def _make_not_found_error(photograph: str | Path) -> InputError:
+    """Return the error for a photograph in which the black squares are not found."""
+    return InputError(
+        f"{photograph}: expected a photograph of the whole colour chart, upright, with "
+        "its four black squares, got one in which they are not found; leave nothing "
+        "dark around the sheet"
+    )
 
 
 def _find_dark_squares(light: Floats) -> list[tuple[float, float, int]]:

@@ -38,7 +38,7 @@ from advsearch.scene.assembly import IMAGE_INPUTS, pose_mesh
 from advsearch.scene.assets import Float32Array, Float64Array, IntArray, Mesh, Shape
 from advsearch.scene.description import NO_ENVIRONMENT, OBJECT, SceneDescription
 from advsearch.scene.parts import MeshPart
-from advsearch.scene.raster import compute_doubled_areas, rasterize_charts
+from advsearch.scene.raster import Charts, compute_doubled_areas, rasterize_charts
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,20 +70,12 @@ class AdversarialRun:
         folder = find_run(run)
         summary = load_attack_summary(folder)
         if summary.adversarial is None:
-            raise InputError(
-                f"{folder}: ended with {summary.ending!r}, so that there is no "
-                "adversarial configuration to export"
-            )
+            raise _make_no_scene_error(folder, summary.ending)
         # A policy or an objective may exist only in the Python session of the run, and
         # is not needed here.
         config = with_evaluation_only(AttackConfig.from_yaml(folder / CONFIG))
         problem, _warnings = problem_from_config(config)
-        # Conditions that vary at random, such as the camera, are those of the trial
-        # (verification render) whose image the run stores.
-        trial = summary.adversarial.trial
-        conditions_seed = None
-        if trial is not None:
-            conditions_seed = seeds.derive_seed(problem.seed, "verification", trial)
+        conditions_seed = _derive_conditions_seed(problem, summary.adversarial.trial)
         u = read_stored_configuration(folder, problem)
         return cls(folder, problem, problem.make_full_configuration(u, conditions_seed))
 
@@ -154,6 +146,19 @@ class AdversarialRun:
             return renderer.scene.input_assembler(renderer.space.inputs(self.u))
 
 
+def _derive_conditions_seed(problem: Problem, trial: int | None) -> int | None:
+    """Return the seed of the conditions that vary at random, such as the camera.
+
+    Args:
+        problem: the problem of the run.
+        trial: the trial (verification render) whose image the run stores; None without
+            one: then there is no seed.
+    """
+    if trial is None:
+        return None
+    return seeds.derive_seed(problem.seed, "verification", trial)
+
+
 BLEED = 3.0  # width of the color beyond the line to cut, in millimetres
 MAX_PIXEL_SIZE = 0.2
 """Maximum size of a printed pixel in millimetres. Larger texels are subdivided, and
@@ -189,6 +194,19 @@ def _load_object_scene(config: AttackConfig) -> Scene:
     )
 
 
+def _make_no_scene_error(folder: Path, ending: str) -> InputError:
+    """Return the error for a run that found no adversarial scene.
+
+    Args:
+        folder: folder of the run.
+        ending: status with which the run ended.
+    """
+    return InputError(
+        f"{folder}: ended with {ending!r}, so that there is no adversarial "
+        "configuration to export"
+    )
+
+
 def make_printable_pieces(run: str | Path, size: float) -> list[Piece]:
     """Return the printable pieces of the adversarial scene of a run of `attack`.
 
@@ -204,37 +222,63 @@ def make_printable_pieces(run: str | Path, size: float) -> list[Piece]:
         InputError: nothing can be printed, or the size is out of range.
         FileFormatError: the run is of another kind, has not finished, or lacks files.
     """
-    if not 1.0 <= size <= MAX_OBJECT_SIZE:
-        raise InputError(
-            "size: expected the object's longest side in millimetres, 1 "
-            f"to {MAX_OBJECT_SIZE:.0f}, got {size}"
-        )
+    _check_printed_size(size)
     folder = find_run(run)
     summary = load_attack_summary(folder)
     config = AttackConfig.from_yaml(folder / CONFIG)
     scene = _load_object_scene(config)
     pieces = list[Piece]()
     for control in make_controls(config.controls):
-        file_stem = to_file_name(control.name)
-        texture_file = folder / ARTIFACTS / f"{file_stem}.png"
+        texture_file = folder / ARTIFACTS / f"{to_file_name(control.name)}.png"
         if control.kind == "patch":
-            pixels = read_png(folder / ARTIFACTS / f"{file_stem}-pixels.png")
             patch_size = size * _get_relative_patch_size(control, config, summary)
-            pixel_size = patch_size / len(pixels)  # as many rows as columns
-            name = f"{control.name}, {patch_size:.1f} mm a side"
-            pieces.append(
-                _make_piece(name, pixels, (pixel_size, pixel_size), inside=None)
-            )
+            pieces.append(_make_patch_piece(control, folder, patch_size))
         elif isinstance(control, TextureControl) and texture_file.is_file():
-            pieces.extend(
-                _make_texture_pieces(control, scene.description, texture_file, size)
-            )
+            description = scene.description
+            pieces += _make_texture_pieces(control, description, texture_file, size)
+    _check_any_pieces(folder, pieces)
+    return pieces
+
+
+def _check_printed_size(size: float) -> None:
+    """Check the longest side of the real object, in millimetres.
+
+    Raises:
+        InputError: it is out of range.
+    """
+    if not 1.0 <= size <= MAX_OBJECT_SIZE:
+        raise InputError(
+            "size: expected the object's longest side in millimetres, 1 "
+            f"to {MAX_OBJECT_SIZE:.0f}, got {size}"
+        )
+
+
+def _check_any_pieces(folder: Path, pieces: list[Piece]) -> None:
+    """Check that a run has at least one piece to print.
+
+    Raises:
+        InputError: it has none.
+    """
     if not pieces:
         raise InputError(
             f"{folder}: it has neither a texture nor a patch, so that there is nothing "
             "to print"
         )
-    return pieces
+
+
+def _make_patch_piece(control: Control, folder: Path, patch_size: float) -> Piece:
+    """Return the piece of a patch, whose pixels the run stores.
+
+    Args:
+        control: control of the patch.
+        folder: folder of the run.
+        patch_size: width and height of the patch in millimetres.
+    """
+    file_stem = to_file_name(control.name)
+    pixels = read_png(folder / ARTIFACTS / f"{file_stem}-pixels.png")
+    pixel_size = patch_size / len(pixels)  # as many rows as columns
+    name = f"{control.name}, {patch_size:.1f} mm a side"
+    return _make_piece(name, pixels, (pixel_size, pixel_size), inside=None)
 
 
 def _make_texture_pieces(
@@ -286,7 +330,11 @@ def _get_relative_patch_size(
         size = config.controls.get(control.name, {}).get("size")
     if isinstance(size, (int, float)):
         return float(size)
-    # not set, or a range
+    return _get_default_patch_size(control)  # not set, or a range
+
+
+def _get_default_patch_size(control: Control) -> float:
+    """Return the default size of a patch, as a fraction of the object's size."""
     default = next(
         parameter.default
         for parameter in control.parameters
@@ -314,25 +362,71 @@ def _find_charts(
     uv_areas = compute_doubled_areas(mesh.uvs[mesh.faces].astype(np.float64))
     raster = rasterize_charts(mesh, (texture.shape[0], texture.shape[1]))
     positions = raster.compute_positions().astype(np.float64)
-    is_printed = raster.is_covered
-    if faces is not None:
-        is_printed = is_printed & np.isin(raster.face_index, faces)
-    charts = _label_charts(is_printed)
+    charts = _label_charts(_find_printed_texels(raster, faces))
     for number, (box, inside) in enumerate(charts, 1):
-        size_and_distortion = _measure_texel_size(positions[box] * scale, inside)
-        if size_and_distortion is None:  # a line or a point, which cannot be printed
-            continue
-        texel_size, distortion = size_and_distortion
-        image = _extend_inside(texture[box], inside)
         # A chart whose texture coordinates are mirrored has a negative signed area.
-        is_mirrored = uv_areas[np.unique(raster.face_index[box][inside])].sum() < 0.0
-        if is_mirrored:  # mirror it back; the size of its texels stays the same
-            image = image[:, ::-1]
-            inside = inside[:, ::-1]
-        title = name if len(charts) == 1 else f"{name}, piece {number}"
-        if distortion >= 0.005:  # half a percent: less is rounded to 0 %
-            title += f" (sizes within it differ by {100 * distortion:.0f} %)"
-        yield _make_piece(title, image, texel_size, inside)
+        chart_faces = np.unique(raster.face_index[box][inside])
+        is_mirrored = bool(uv_areas[chart_faces].sum() < 0.0)
+        chart_name = name if len(charts) == 1 else f"{name}, piece {number}"
+        chart_positions = positions[box] * scale
+        piece = _make_chart_piece(
+            chart_name, texture[box], chart_positions, inside, is_mirrored=is_mirrored
+        )
+        if piece is not None:
+            yield piece
+
+
+def _make_chart_piece(
+    name: str,
+    texture: Float32Array,
+    positions: Float64Array,
+    inside: Mask,
+    *,
+    is_mirrored: bool,
+) -> Piece | None:
+    """Return a chart as a piece; None for a line or a point, which cannot be printed.
+
+    Args:
+        name: name of the chart.
+        texture: (h, w, 3), the image in the box around the chart.
+        positions: (h, w, 3) of its texels, in millimetres.
+        inside: (h, w) bool, the texels of the chart.
+        is_mirrored: whether the chart is mirrored in the texture.
+    """
+    size_and_distortion = _measure_texel_size(positions, inside)
+    if size_and_distortion is None:
+        return None
+    texel_size, distortion = size_and_distortion
+    image = _extend_inside(texture, inside)
+    if is_mirrored:  # mirror it back; the size of its texels stays the same
+        image = image[:, ::-1]
+        inside = inside[:, ::-1]
+    title = name + _describe_distortion(distortion)
+    return _make_piece(title, image, texel_size, inside)
+
+
+def _find_printed_texels(raster: Charts, faces: IntArray | None) -> Mask:
+    """Return which texels (h, w) of a texture are printed.
+
+    Args:
+        raster: the face that each texel belongs to.
+        faces: indices of the faces to print; None for all.
+    """
+    if faces is None:
+        return raster.is_covered
+    is_printed: Mask = raster.is_covered & np.isin(raster.face_index, faces)
+    return is_printed
+
+
+def _describe_distortion(distortion: float) -> str:
+    """Return by how much the sizes of texels differ, for a title; "" if they are equal.
+
+    Args:
+        distortion: coefficient of variation of the sizes.
+    """
+    if distortion >= 0.005:  # half a percent: less is rounded to 0 %
+        return f" (sizes within it differ by {100 * distortion:.0f} %)"
+    return ""
 
 
 def _label_charts(is_printed: Mask) -> list[tuple[tuple[slice, slice], Mask]]:
@@ -376,13 +470,10 @@ def _measure_texel_size(
         these distances. None if the part is a line or a point of texels, which has no
         area to print.
     """
-    distances_by_axis = []
-    for axis in (1, 0):  # along rows (width), then along columns (height)
-        # one distance for each texel that has a next texel along the axis
-        distances = np.linalg.norm(np.diff(positions, axis=axis), axis=-1)
-        is_inside = np.delete(inside, -1, axis)  # all but the last texel
-        is_next_inside = np.delete(inside, 0, axis)  # all but the first texel
-        distances_by_axis.append(distances[is_inside & is_next_inside])
+    # along rows (width), then along columns (height)
+    distances_by_axis = [
+        _measure_texel_distances(positions, inside, axis) for axis in (1, 0)
+    ]
     has_both = all(len(distances) > 0 for distances in distances_by_axis)
     if not has_both:  # the texels are a line or a point
         return None
@@ -393,6 +484,24 @@ def _measure_texel_size(
         float(np.std(distances) / np.mean(distances)) for distances in distances_by_axis
     )
     return (width, height), distortion
+
+
+def _measure_texel_distances(
+    positions: Float64Array, inside: Mask, axis: int
+) -> Float64Array:
+    """Return the distances (n,) of the texels of a part to the next along an axis.
+
+    Args:
+        positions: (h, w, 3) of the texels.
+        inside: (h, w) bool, the texels of the part.
+        axis: 0 along columns, 1 along rows.
+    """
+    # one distance for each texel that has a next texel along the axis
+    distances = np.linalg.norm(np.diff(positions, axis=axis), axis=-1)
+    is_inside = np.delete(inside, -1, axis)  # all but the last texel
+    is_next_inside = np.delete(inside, 0, axis)  # all but the first texel
+    part_distances: Float64Array = distances[is_inside & is_next_inside]
+    return part_distances
 
 
 def _make_piece(
@@ -411,10 +520,7 @@ def _make_piece(
             image.
     """
     subdivisions = _count_subdivisions(max(pixel_size))
-    if subdivisions > 1:
-        fine = enlarge(torch.from_numpy(np.ascontiguousarray(image)), subdivisions)
-    else:
-        fine = torch.from_numpy(image)
+    fine = _subdivide_pixels(image, subdivisions)
     fine_width = pixel_size[0] / subdivisions
     fine_height = pixel_size[1] / subdivisions
     bleed_columns = math.ceil(BLEED / fine_width)
@@ -422,17 +528,38 @@ def _make_piece(
     padding = ((bleed_rows, bleed_rows), (bleed_columns, bleed_columns))
     # the edge is repeated into the bleed
     levels = np.pad(to_8bit(fine.numpy()), (*padding, (0, 0)), mode="edge")
-    mask = None
-    if inside is not None and not inside.all():
-        fine_inside = inside.repeat(subdivisions, axis=0).repeat(subdivisions, axis=1)
-        mask = np.pad(fine_inside, padding)  # the bleed is outside of the cut
     return Piece(
         name=name,
         picture=levels,
         pixel_size_mm=(fine_width, fine_height),
         bleed=(bleed_columns, bleed_rows),
-        cut_mask=mask,
+        cut_mask=_make_cut_mask(inside, subdivisions, padding),
     )
+
+
+def _make_cut_mask(
+    inside: Mask | None,
+    subdivisions: int,
+    padding: tuple[tuple[int, int], tuple[int, int]],
+) -> Mask | None:
+    """Return the part to cut out with its bleed; None for the full image.
+
+    Args:
+        inside: (h, w) bool, the part; None for the full image.
+        subdivisions: number of parts of a pixel along each axis.
+        padding: width of the bleed in these parts: above and below, left and right.
+    """
+    if inside is None or inside.all():
+        return None
+    fine_inside = inside.repeat(subdivisions, axis=0).repeat(subdivisions, axis=1)
+    return np.pad(fine_inside, padding)  # the bleed is outside of the cut
+
+
+def _subdivide_pixels(image: Float32Array, subdivisions: int) -> Tensor:
+    """Return an image (h, w, 3) with each pixel divided along both axes."""
+    if subdivisions > 1:
+        return enlarge(torch.from_numpy(np.ascontiguousarray(image)), subdivisions)
+    return torch.from_numpy(image)
 
 
 def _count_subdivisions(pixel_size: float) -> int:

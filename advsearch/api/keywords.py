@@ -14,6 +14,7 @@ import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass, field
 from functools import wraps
 from pathlib import Path
 from typing import Any, Literal, TypedDict, TypeVar
@@ -141,34 +142,74 @@ def with_settings_signature(config: type[Config]) -> Callable[[Function], Functi
     """
 
     def decorate(function: Function) -> Function:
-        declared_signature = inspect.signature(function)
-        parameters = [
-            parameter
-            for parameter in declared_signature.parameters.values()
-            if parameter.kind is not parameter.VAR_KEYWORD
-        ]
-        declared_names = [parameter.name for parameter in parameters]
-        setting_lines = []
-        for setting in settings(config):
-            name = setting.field.removesuffix("_")  # the field of `set` is `set_`
-            is_declared = name in declared_signature.parameters
-            if is_declared or setting.required:
-                continue
-            parameters.append(_make_parameter(config, setting, name))
-            line = f"{name}: {setting.text}"
-            setting_lines.append(textwrap.fill(line, 110, subsequent_indent="    "))
-        signature = _Signature(
-            parameters, return_annotation=declared_signature.return_annotation
-        )
-        signature.short = declared_signature  # `help` displays this shorter one
-        wrapper = _wrap_call(function, signature)
-        wrapper.__doc__ = _make_docstring(
-            function.__doc__ or "", declared_names, config.command, setting_lines
-        )
-        wrapper.__signature__ = signature  # type: ignore[attr-defined]
-        return wrapper
+        return _document_settings(function, config)
 
     return decorate
+
+
+def _document_settings(function: Function, config: type[Config]) -> Function:
+    """Return a function with all settings in its signature and its docstring.
+
+    Args:
+        function: function that declares `**settings`.
+        config: class with the settings.
+    """
+    declared_signature = inspect.signature(function)
+    declared_parameters = _list_named_parameters(declared_signature)
+    declared_names = [parameter.name for parameter in declared_parameters]
+    further_settings = _list_further_settings(config, declared_signature)
+    setting_parameters = [
+        _make_parameter(config, setting, name) for name, setting in further_settings
+    ]
+    signature = _Signature(
+        [*declared_parameters, *setting_parameters],
+        return_annotation=declared_signature.return_annotation,
+    )
+    signature.short = declared_signature  # `help` displays this shorter one
+    wrapper = _wrap_call(function, signature)
+    wrapper.__doc__ = _make_docstring(
+        function.__doc__ or "",
+        declared_names,
+        config.command,
+        _format_setting_lines(further_settings),
+    )
+    wrapper.__signature__ = signature  # type: ignore[attr-defined]
+    return wrapper
+
+
+def _list_named_parameters(signature: inspect.Signature) -> list[inspect.Parameter]:
+    """Return the parameters of a signature without `**settings`."""
+    return [
+        parameter
+        for parameter in signature.parameters.values()
+        if parameter.kind is not parameter.VAR_KEYWORD
+    ]
+
+
+def _format_setting_lines(named_settings: Sequence[tuple[str, Setting]]) -> list[str]:
+    """Return an entry for each setting, "NAME: text", for a docstring."""
+    return [
+        textwrap.fill(f"{name}: {setting.text}", 110, subsequent_indent="    ")
+        for name, setting in named_settings
+    ]
+
+
+def _list_further_settings(
+    config: type[Config], declared_signature: inspect.Signature
+) -> list[tuple[str, Setting]]:
+    """Return the optional settings that a function does not declare, with their names.
+
+    Args:
+        config: class with the settings.
+        declared_signature: the signature as the function declares it.
+    """
+    further_settings = []
+    for setting in settings(config):
+        name = setting.field.removesuffix("_")  # the field of `set` is `set_`
+        is_declared = name in declared_signature.parameters
+        if not is_declared and not setting.required:
+            further_settings.append((name, setting))
+    return further_settings
 
 
 def _make_parameter(
@@ -198,25 +239,47 @@ def _wrap_call(function: Function, signature: _Signature) -> Function:
     @wraps(function)
     def wrapper(*args: Any, **keywords: Any) -> Any:
         _check_call(function.__name__, signature, args, keywords)
-        # Values that are nested too deeply are not converted: the settings reject them.
-        plain_keywords = {}
-        for key, value in keywords.items():
-            is_converted = key not in UNCONVERTED_ARGUMENTS and is_shallow(value)
-            plain_keywords[key] = to_python(value) if is_converted else value
+        plain_keywords = _convert_keywords(keywords)
         with ExitStack() as stack:
             stack.enter_context(hold_process_lock())
             if "progress" in declared_parameters:
                 progress = open_progress(plain_keywords.get("progress"))
                 plain_keywords["progress"] = stack.enter_context(progress)
-            # Functions that accept an object for one of these declare it as a
-            # parameter. For all others it is a setting, which has to be a name.
-            for key in ("task", "objective", "policy"):
-                takes_object = key in declared_parameters
-                if key in plain_keywords and not takes_object:
-                    _check_is_name(function.__name__, key, plain_keywords[key])
+            _check_named_objects(function.__name__, plain_keywords, declared_parameters)
             return function(*args, **plain_keywords)
 
     return wrapper  # type: ignore[return-value]
+
+
+def _convert_keywords(keywords: Mapping[str, Any]) -> dict[str, Any]:
+    """Return keyword arguments with numbers and arrays as Python's."""
+    # Values that are nested too deeply are not converted: the settings reject them.
+    plain_keywords = {}
+    for key, value in keywords.items():
+        is_converted = key not in UNCONVERTED_ARGUMENTS and is_shallow(value)
+        plain_keywords[key] = to_python(value) if is_converted else value
+    return plain_keywords
+
+
+def _check_named_objects(
+    function_name: str,
+    keywords: Mapping[str, Any],
+    declared_parameters: Mapping[str, inspect.Parameter],
+) -> None:
+    """Check that a task, objective or policy is a name, where no object is accepted.
+
+    Functions that accept an object for one of these declare it as a parameter. For all
+    others it is a setting, which has to be a name.
+
+    Args:
+        function_name: name of the function.
+        keywords: keywords of its call.
+        declared_parameters: the parameters that it declares, by name.
+    """
+    for key in ("task", "objective", "policy"):
+        takes_object = key in declared_parameters
+        if key in keywords and not takes_object:
+            _check_is_name(function_name, key, keywords[key])
 
 
 UNCONVERTED_ARGUMENTS = ("scene", "model", "beside", "progress", "metrics", "tracker")
@@ -249,11 +312,31 @@ def _check_call(
     declared_parameters = signature.short.parameters
     positional = dict(zip(declared_parameters, args, strict=False))
     check_types({**declared_parameters, **RUN_PARAMETER}, {**positional, **keywords})
+    arguments = _bind_arguments(name, signature, args, keywords)
+    allow_code_in_settings({**arguments, **keywords})
+
+
+def _bind_arguments(
+    name: str,
+    signature: _Signature,
+    args: Sequence[Any],
+    keywords: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Return the arguments of a call by the names of their parameters.
+
+    Args:
+        name: name of the function.
+        signature: its signature.
+        args: arguments by position.
+        keywords: keywords by name.
+
+    Raises:
+        TypeError: there is no such argument, or one is missing.
+    """
     try:
-        bound = signature.bind(*args, **keywords)
+        return signature.bind(*args, **keywords).arguments
     except TypeError as error:
         raise TypeError(f"{name}() {error}") from None
-    allow_code_in_settings({**bound.arguments, **keywords})
 
 
 def _check_is_name(function_name: str, key: str, value: object) -> None:
@@ -320,24 +403,34 @@ def make_hint(field: str, kind: Any) -> str:
     may_be_mapping = field == "label" and "dict" in text
     if field in PYTHON_HINTS and not may_be_mapping:
         return PYTHON_HINTS[field]
+    string_hint = "Path | Names" if field in PYTHON_LIST_SETTINGS else "str | Path"
+    hints = [_make_type_hint(name, string_hint) for name in _split_union(text)]
+    return " | ".join(hints)
+
+
+def _split_union(text: str) -> list[str]:
+    """Return the types of an annotation: those of "A | B", or of "Optional[A]"."""
     optional = re.fullmatch(r"Optional\[(.*)\]", text)
     if optional:
-        types = [optional[1], "None"]
-    else:
-        # Split "A | B[C | D]" at each | outside of brackets: no "]" follows it before
-        # the next "[".
-        outer_bar = r" \| (?![^\[]*\])"
-        types = re.split(outer_bar, text)
-    string_hint = "Path | Names" if field in PYTHON_LIST_SETTINGS else "str | Path"
-    hints = []
-    for type_name in types:
-        if type_name == "str":
-            hints.append(string_hint)
-        elif type_name.startswith("dict["):
-            hints.append("Mapping[str, Any]")
-        else:
-            hints.append(type_name)
-    return " | ".join(hints)
+        return [optional[1], "None"]
+    # Split "A | B[C | D]" at each | outside of brackets: no "]" follows it before the
+    # next "[".
+    outer_bar = r" \| (?![^\[]*\])"
+    return re.split(outer_bar, text)
+
+
+def _make_type_hint(type_name: str, string_hint: str) -> str:
+    """Return the annotation of a declared type for Python callers.
+
+    Args:
+        type_name: name of the type, such as "int".
+        string_hint: the annotation where a text is declared.
+    """
+    if type_name == "str":
+        return string_hint
+    if type_name.startswith("dict["):
+        return "Mapping[str, Any]"
+    return type_name
 
 
 def _make_docstring(
@@ -353,27 +446,37 @@ def _make_docstring(
         setting_lines: a line for each setting.
     """
     summary, _, argument_text = inspect.cleandoc(text).partition("\n\nArgs:\n")
-    # Some docstrings have the sentence below already, with details of their own.
-    summary_line = " ".join(summary.split())
-    mentions_settings = "other arguments are the settings of" in summary_line
-    if not mentions_settings:
-        summary += (
-            "\n\nAll other arguments are the settings of `advsearch "
-            f"{command}`. {RUN_STORED}"
-        )
-    # An entry is "NAME: text", and the text may continue on indented lines. So a new
-    # entry begins where a line begins with a name and a colon.
-    entries = re.split(r"(?m)^(?=\w+: )", textwrap.dedent(argument_text))
-    entry_of_name = {
-        entry.partition(":")[0]: entry.rstrip() for entry in entries if entry
-    }
+    entry_of_name = _split_argument_entries(argument_text)
     # A name without an entry of its own has one in `SHARED_ARGUMENTS`.
     argument_entries = [
         entry_of_name.get(name, f"{name}: {SHARED_ARGUMENTS.get(name)}")
         for name in names
     ]
     arguments = textwrap.indent("\n".join([*argument_entries, *setting_lines]), "    ")
-    return f"{summary}\n\nArgs:\n{arguments}\n\nRaises:\n    {SHARED_ERRORS}"
+    return (
+        f"{_complete_summary(summary, command)}\n\nArgs:\n{arguments}\n\nRaises:\n"
+        f"    {SHARED_ERRORS}"
+    )
+
+
+def _complete_summary(summary: str, command: str) -> str:
+    """Return a docstring's beginning with a sentence about the settings of a command."""
+    # Some docstrings have the sentence below already, with details of their own.
+    summary_line = " ".join(summary.split())
+    if "other arguments are the settings of" in summary_line:
+        return summary
+    return (
+        f"{summary}\n\nAll other arguments are the settings of `advsearch "
+        f"{command}`. {RUN_STORED}"
+    )
+
+
+def _split_argument_entries(argument_text: str) -> dict[str, str]:
+    """Return the entries of a docstring's section of arguments by their names."""
+    # An entry is "NAME: text", and the text may continue on indented lines. So a new
+    # entry begins where a line begins with a name and a colon.
+    entries = re.split(r"(?m)^(?=\w+: )", textwrap.dedent(argument_text))
+    return {entry.partition(":")[0]: entry.rstrip() for entry in entries if entry}
 
 
 def make_config(config: type[ConfigType], **keywords: Any) -> ConfigType:
@@ -392,44 +495,108 @@ def make_config(config: type[ConfigType], **keywords: Any) -> ConfigType:
         InputError: a setting is wrong, or contradicts an object.
     """
     settings = {name: value for name, value in keywords.items() if value is not None}
-    objects: dict[tuple[str, str], Any] = {}
-    python_only: list[PythonOnly] = []
-
-    scene = settings.get("object")
-    model = settings.get("model")
-    # Workers are other processes, to which these objects cannot be sent.
-    if isinstance(scene, loading.Scene) or isinstance(model, (Model, nn.Module)):
-        check_no_worker_settings(settings)
-    if isinstance(model, (Model, nn.Module)):
-        settings["model"] = get_model_name(model)
-        objects[MODEL, settings["model"]] = model
-        if is_session_only(model):
-            python_only.append(PythonOnly("model", settings["model"]))
-    if isinstance(scene, loading.Scene):
-        # The scene was loaded already, so that settings of loading come too late.
-        check_no_scene_settings(
-            {name: value for name, value in settings.items() if name != "object"}
-        )
-        # the settings with which it was loaded, with the name of its object
-        scene_settings = loading.scene_to_settings(scene)
-        settings |= {
-            name: value for name, value in scene_settings.items() if value is not None
-        }
-        objects[SCENE, settings["object"]] = scene
-        if scene.is_session_only:
-            python_only.append(PythonOnly("scene"))
+    _check_no_workers_for_objects(settings)
+    replaced = _ReplacedObjects()
+    replaced.replace_model(settings)
+    replaced.replace_scene(settings)
     for name in ("controls", "over"):
-        instances = _replace_control_objects(settings, name)
-        objects |= {(CONTROL, control.name): control for control in instances}
-        python_only += [
-            PythonOnly("control", kind)
-            for kind in loading.list_session_only_controls(instances)
-        ]
+        replaced.replace_controls(settings, name)
     return (
         config(**settings)
-        .with_python_objects(objects)
-        .with_python_only_parts(python_only)
+        .with_python_objects(replaced.objects)
+        .with_python_only_parts(replaced.python_only)
     )
+
+
+def _check_no_workers_for_objects(settings: Mapping[str, Any]) -> None:
+    """Check that there are no settings of workers if the scene or the model is an
+    object.
+
+    Workers are other processes, to which these objects cannot be sent.
+
+    Raises:
+        InputError: there are such settings.
+    """
+    has_scene = isinstance(settings.get("object"), loading.Scene)
+    if has_scene or isinstance(settings.get("model"), (Model, nn.Module)):
+        check_no_worker_settings(settings)
+
+
+@dataclass
+class _ReplacedObjects:
+    """Python objects that were settings, and were replaced by their names.
+
+    Attributes:
+        objects: the objects by kind, such as `MODEL`, and name.
+        python_only: those that only this Python session has.
+    """
+
+    objects: dict[tuple[str, str], Any] = field(default_factory=dict)
+    python_only: list[PythonOnly] = field(default_factory=list)
+
+    def replace_model(self, settings: dict[str, Any]) -> None:
+        """Replace a model that is an object by its name; settings change in place."""
+        model = settings.get("model")
+        if not isinstance(model, (Model, nn.Module)):
+            return
+        name = get_model_name(model)
+        settings["model"] = name
+        self.objects[MODEL, name] = model
+        if is_session_only(model):
+            self.python_only.append(PythonOnly("model", name))
+
+    def replace_scene(self, settings: dict[str, Any]) -> None:
+        """Replace a scene that is an object by its settings, which change in place.
+
+        Raises:
+            InputError: there are settings of loading, too, which come too late.
+        """
+        scene = settings.get("object")
+        if not isinstance(scene, loading.Scene):
+            return
+        _replace_scene_object(settings, scene)
+        self.objects[SCENE, settings["object"]] = scene
+        if scene.is_session_only:
+            self.python_only.append(PythonOnly("scene"))
+
+    def replace_controls(self, settings: dict[str, Any], name: str) -> None:
+        """Replace controls that are objects by their names and options.
+
+        Args:
+            settings: settings by name, which are changed in place.
+            name: name of the setting, "controls" or "over".
+        """
+        instances = _replace_control_objects(settings, name)
+        self.objects |= {(CONTROL, control.name): control for control in instances}
+        self.python_only += _list_session_only_parts(instances)
+
+
+def _replace_scene_object(settings: dict[str, Any], scene: loading.Scene) -> None:
+    """Replace a scene that is an object by the settings with which it was loaded.
+
+    Args:
+        settings: settings by name, which are changed in place.
+        scene: the scene.
+
+    Raises:
+        InputError: there are settings of loading, too, which come too late.
+    """
+    check_no_scene_settings(
+        {name: value for name, value in settings.items() if name != "object"}
+    )
+    # the settings with which it was loaded, with the name of its object
+    scene_settings = loading.scene_to_settings(scene)
+    settings |= {
+        name: value for name, value in scene_settings.items() if value is not None
+    }
+
+
+def _list_session_only_parts(instances: Sequence[Any]) -> list[PythonOnly]:
+    """Return those of some control objects that only this Python session has."""
+    return [
+        PythonOnly("control", kind)
+        for kind in loading.list_session_only_controls(instances)
+    ]
 
 
 def _replace_control_objects(settings: dict[str, Any], name: str) -> Sequence[Any]:

@@ -118,37 +118,45 @@ def _check_scene(values: Mapping[str, Any]) -> None:
         values: values of the settings, by name. "things" are additional objects, as in
             "car@12,3.5,name=taxi; person@6,-2".
     """
-    things = [
-        part.strip()
-        for part in str(values.get("things") or "").split(";")
-        if part.strip()
-    ]
+    things = _split_things(values)
     thing_objects = [thing.partition("@")[0].strip() for thing in things]
-    objects = [
-        *split_names(values.get("object") or ""),
-        *split_names(values.get("held_out") or ""),
-        *thing_objects,
-    ]
-    environments = [
-        *split_names(values.get("environment") or ""),
-        *split_names(values.get("held_out_environment") or ""),
-    ]
-    _check_words(
-        "object",
-        [name for name in objects if name != "all"],
-        list_objects(),
-        OBJECT_HINT,
-    )
-    _check_words(
-        "environment",
-        [name for name in environments if name != "none"],
-        list_environments(),
-        MAP_HINT,
-    )
+    objects = [*_list_main_objects(values), *thing_objects]
+    known_objects = [name for name in objects if name != "all"]
+    _check_words("object", known_objects, list_objects(), OBJECT_HINT)
+    _check_environments(values)
     judge = values.get("judge")
     # A scene in a file may have further objects, whose names are not known here.
     if things and judge and objects[0] in list_objects():
         _check_judge(judge, things, thing_objects)
+
+
+def _list_main_objects(values: Mapping[str, Any]) -> list[str]:
+    """Return the objects in settings, without additional ones: first those of the
+    search, then those that are held out.
+    """
+    return [
+        *split_names(values.get("object") or ""),
+        *split_names(values.get("held_out") or ""),
+    ]
+
+
+def _split_things(values: Mapping[str, Any]) -> list[str]:
+    """Return the additional objects in settings, each with its options."""
+    return [
+        part.strip()
+        for part in str(values.get("things") or "").split(";")
+        if part.strip()
+    ]
+
+
+def _check_environments(values: Mapping[str, Any]) -> None:
+    """Check the names of the environments in settings."""
+    environments = [
+        *split_names(values.get("environment") or ""),
+        *split_names(values.get("held_out_environment") or ""),
+    ]
+    known_environments = [name for name in environments if name != "none"]
+    _check_words("environment", known_environments, list_environments(), MAP_HINT)
 
 
 def _check_judge(judge: str, things: Iterable[str], objects: Iterable[str]) -> None:
@@ -187,15 +195,7 @@ def _check_controls(values: Mapping[str, Any]) -> None:
         UnknownNameError: a name is nearly that of a built-in control.
     """
     controls = {**(values.get("controls") or {}), **(values.get("over") or {})}
-    names = []
-    for name, options in controls.items():
-        # A control may have any name if its options state the kind.
-        kind = str((options or {}).get("kind") or name)
-        is_class = re.search(r":[A-Z]", kind)  # "package.module:Class"
-        if not is_class:
-            # "light" of "light:key", and "pose" of "pose.yaw"
-            name_of_control = re.split(r"[:.]", kind)[0]
-            names.append(name_of_control)
+    names = _list_checked_controls(controls)
     built_in_controls = list_built_ins("control")
     # The name of a parameter passes here: later the registry reports it in a message
     # that also names the control with this parameter.
@@ -207,6 +207,24 @@ def _check_controls(values: Mapping[str, Any]) -> None:
     _check_entries("control", names_like_controls, "controls")
 
 
+def _list_checked_controls(controls: Mapping[str, Any]) -> list[str]:
+    """Return the names of the controls in a setting that are no classes of the user.
+
+    Args:
+        controls: options by the name of the control.
+    """
+    names = []
+    for name, options in controls.items():
+        # A control may have any name if its options state the kind.
+        kind = str((options or {}).get("kind") or name)
+        is_class = re.search(r":[A-Z]", kind)  # "package.module:Class"
+        if not is_class:
+            # "light" of "light:key", and "pose" of "pose.yaw"
+            name_of_control = re.split(r"[:.]", kind)[0]
+            names.append(name_of_control)
+    return names
+
+
 def _check_suite(suite: str) -> None:
     """Check that the file of a suite exists.
 
@@ -215,6 +233,13 @@ def _check_suite(suite: str) -> None:
     """
     if Path(suite).exists():
         return
+    best_file = _find_similar_suite(suite)
+    hint = "" if best_file is None else f"; did you mean {best_file}?"
+    raise InputError(f"suite: there is no file {suite}{hint}")
+
+
+def _find_similar_suite(suite: str) -> Path | None:
+    """Return the file of a suite whose name is like a name; None if there is none."""
     # YAML files in the stated folder, and in the folder with our suites
     files = [
         file
@@ -222,12 +247,9 @@ def _check_suite(suite: str) -> None:
         for file in sorted(folder.glob("*.y*ml"))
     ]
     similar_names = find_similar_names(Path(suite).stem, [file.stem for file in files])
-    hint = ""
-    if similar_names:
-        best_name = similar_names[0]
-        best_file = next(file for file in files if file.stem == best_name)
-        hint = f"; did you mean {best_file}?"
-    raise InputError(f"suite: there is no file {suite}{hint}")
+    if not similar_names:
+        return None
+    return next(file for file in files if file.stem == similar_names[0])
 
 
 def _check_entries(kind: str, names: Iterable[str], group: str) -> None:

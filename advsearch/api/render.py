@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict
@@ -94,12 +94,7 @@ def _load_attack(summary: AttackSummary, path: Path) -> AttackResult:
     """
     clean = read_png(path / IMAGES / "clean.png")
     adversarial = read_png(path / IMAGES / "adversarial.png")
-    artifacts = dict[str, Tensor]()
-    for file in sorted((path / ARTIFACTS).glob("*.exr")):
-        planes, _ = read_exr(file, read_bytes(file, "a picture of a run", LARGEST_FILE))
-        artifacts[file.stem] = torch.from_numpy(
-            np.stack([np.asarray(plane, np.float32) for plane in planes], axis=-1)
-        )
+    artifacts = _load_artifacts(path)
     return AttackResult(
         summary=summary,
         run=path,
@@ -111,6 +106,24 @@ def _load_attack(summary: AttackSummary, path: Path) -> AttackResult:
         # The scene and the model are loaded when they are needed for the first time.
         parts=cache(partial(load_parts_of_run, path)),
     )
+
+
+def _load_artifacts(path: Path) -> dict[str, Tensor]:
+    """Load the artifacts of a run, such as textures, by the names of their files.
+
+    Args:
+        path: folder of the run.
+
+    Returns:
+        Images (h, w, channels), linear.
+    """
+    artifacts = dict[str, Tensor]()
+    for file in sorted((path / ARTIFACTS).glob("*.exr")):
+        planes, _ = read_exr(file, read_bytes(file, "a picture of a run", LARGEST_FILE))
+        artifacts[file.stem] = torch.from_numpy(
+            np.stack([np.asarray(plane, np.float32) for plane in planes], axis=-1)
+        )
+    return artifacts
 
 
 class ModelKeywords(TypedDict, total=False):
@@ -179,9 +192,48 @@ def render_picture_file(
     # an .exr file cannot show several views
     out = check_image_path(config.out, n_views=config.around or 1)
     aovs = parse_aovs(config.aov)
+    _check_single_view_of_aovs(config, aovs)
+    _check_replaces_no_input(config, out)
+    rendering, model_warnings = _render_configuration(
+        config, with_aovs=bool(aovs), progress=progress
+    )
+    warnings = [*rendering.warnings, *model_warnings]
+    for text in warnings:
+        progress.message(text)
+    if aovs:  # layers of ground truth per pixel
+        rendering.save_aov(out, aovs)
+    image_size = rendering.save(out)
+    prediction_path = rendering.save_predictions(out)
+    return rendering.result(out, image_size, warnings, prediction_path)
+
+
+def _check_single_view_of_aovs(config: RenderConfig, aovs: Collection[str]) -> None:
+    """Check that layers of ground truth are rendered for a single view only.
+
+    Args:
+        config: settings of the image.
+        aovs: names of the layers.
+
+    Raises:
+        InputError: there are layers, and several views.
+    """
     if aovs and config.around is not None:
         raise InputError("aov: is of one view; leave `around` out")
-    _check_replaces_no_input(config, out)
+
+
+def _render_configuration(
+    config: RenderConfig, *, with_aovs: bool, progress: Progress
+) -> tuple[Rendering, Sequence[str]]:
+    """Render the scene of a configuration, with the predictions of its model.
+
+    Args:
+        config: settings of the scene, the model and the image.
+        with_aovs: whether to render layers of ground truth, too.
+        progress: object that displays the progress.
+
+    Returns:
+        The rendered image, and the warnings of loading the model.
+    """
     progress.stage("loading the scene and the model")
     check_run_settings(config)
     controls = make_configured_controls(config, config.controls)
@@ -197,18 +249,11 @@ def render_picture_file(
         controls=controls,
         around=config.around,
         spp=config.spp,
-        aov=bool(aovs),
+        aov=with_aovs,
         progress=progress,
         **config.image_settings,
     )
-    warnings = [*rendering.warnings, *model_warnings]
-    for text in warnings:
-        progress.message(text)
-    if aovs:  # layers of ground truth per pixel
-        rendering.save_aov(out, aovs)
-    image_size = rendering.save(out)
-    prediction_path = rendering.save_predictions(out)
-    return rendering.result(out, image_size, warnings, prediction_path)
+    return rendering, model_warnings
 
 
 def _check_replaces_no_input(config: RenderConfig, out: Path) -> None:

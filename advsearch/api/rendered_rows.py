@@ -15,6 +15,7 @@ from torch import Tensor
 
 from advsearch.config import SceneConfig
 from advsearch.engine.loading import Scene
+from advsearch.engine.problem import Problem
 from advsearch.engine.rendering import make_facts
 from advsearch.engine.verifier import read_stored_configuration
 from advsearch.errors import FileFormatError, InputError
@@ -22,11 +23,12 @@ from advsearch.options import Value
 from advsearch.progress import Progress
 from advsearch.questions.attack.carry_out import (
     ROLES_IN_SEARCH,
+    AttackParts,
     load_parts_of_run,
     make_problem_with_warnings,
 )
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.summary import load_attack_summary
+from advsearch.questions.attack.summary import AttackSummary, load_attack_summary
 from advsearch.questions.sweep.carry_out import load_scenes_of_sweep
 from advsearch.questions.sweep.job import KIND, SceneLoader
 from advsearch.questions.sweep.settings import SweepConfig
@@ -116,13 +118,31 @@ def _render_run(folder: Path, every: bool, progress: Progress) -> Iterator[Rende
                 yield replace(rendered, name=f"{part.name}-{rendered.name}")
         return
     command = str(read_yaml(folder / CONFIG).get("command"))
+    _check_renderable_command(folder, command)
+    _check_renderable_parts(folder)
+    yield from RENDERERS[command](folder, every, progress)
+
+
+def _check_renderable_command(folder: Path, command: str) -> None:
+    """Check that the images of a run's command can be rendered again.
+
+    Raises:
+        InputError: they cannot.
+    """
     if command not in RENDERERS:
         raise InputError(
             f"{folder}: expected a run of {' or '.join(RENDERERS)}, or one with such "
             f"parts, got one of {command}"
         )
-    # Objects that existed only in the Python session of the run, and that rendering
-    # needs. Others, such as a policy, were needed by the search only.
+
+
+def _check_renderable_parts(folder: Path) -> None:
+    """Check that nothing that rendering needs existed only in a Python session.
+
+    Raises:
+        InputError: something did.
+    """
+    # Others, such as a policy, were needed by the search only.
     missing = [
         part.text
         for part in read_python_only(folder)
@@ -133,7 +153,6 @@ def _render_run(folder: Path, every: bool, progress: Progress) -> Iterator[Rende
             f"{folder}: {', '.join(missing)}: only the Python session that "
             "asked has what renders it"
         )
-    yield from RENDERERS[command](folder, every, progress)
 
 
 def _render_sweep(
@@ -154,24 +173,49 @@ def _render_sweep(
     scenes = load_scenes_of_sweep(config.model_copy(update={"metrics": {}}))
     job = scenes.job
     rows_of_image = _read_sweep_rows(folder, len(job.models))
-    # An image that was not judged (`correct` is None) counts as wrong.
-    images = sorted(
+    images = _select_sweep_images(rows_of_image, every)
+    _check_image_indices(folder, images, job.images_per_scene * len(job.scenes))
+    progress.stage("rendering pictures", len(images))
+    for image in images:
+        rows = sorted(rows_of_image[image], key=lambda row: row.step)
+        yield _render_sweep_image(scenes, image, rows)
+        progress.advance(1)
+
+
+def _select_sweep_images(
+    rows_of_image: Mapping[int, Sequence[Row]], every: bool
+) -> list[int]:
+    """Return the sorted indices of the images to render.
+
+    Args:
+        rows_of_image: rows of the sweep by the index of their image.
+        every: whether to select all images; otherwise only those about which a model is
+            wrong. An image that was not judged (`correct` is None) counts as wrong.
+    """
+    return sorted(
         image
         for image, rows in rows_of_image.items()
         if every or not all(row.correct for row in rows)
     )
-    n_images = job.images_per_scene * len(job.scenes)
+
+
+def _check_image_indices(folder: Path, images: Sequence[int], n_images: int) -> None:
+    """Check that a sweep has the images of its rows.
+
+    Args:
+        folder: folder of the run, for the message.
+        images: sorted indices of the images of its rows.
+        n_images: number of images that its settings make.
+
+    Raises:
+        FileFormatError: it does not.
+    """
     # The indices are sorted, so that checking the first and the last one is enough.
     if images and not 0 <= images[0] <= images[-1] < n_images:
         raise FileFormatError(
             f"{folder / NAME}: expected rows of its {n_images} pictures, got one of "
             "another"
         )
-    progress.stage("rendering pictures", len(images))
-    for image in images:
-        rows = sorted(rows_of_image[image], key=lambda row: row.step)
-        yield _render_sweep_image(scenes, image, rows)
-        progress.advance(1)
 
 
 def _render_sweep_image(
@@ -190,12 +234,7 @@ def _render_sweep_image(
     query = queries[0]  # all models get the same image
     scene = job.scenes[loaded_scene.number]
     picture = loaded_scene.render_image(query)
-    # whether the first model was right in the run; None if that is not stored
-    was_right = next(
-        # the steps of an image are in the order of the models
-        (row.correct for row in rows if row.step % len(job.models) == 0),
-        None,
-    )
+    was_right = _get_first_prediction(rows, len(job.models))
     problem_of_first_model = loaded_scene.problems[0]
     is_right = problem_of_first_model.judge(picture, query.u).right
     return RenderedRow(
@@ -209,6 +248,16 @@ def _render_sweep_image(
         values=rows[0].values,
         is_reproduced=was_right in (None, is_right),
     )
+
+
+def _get_first_prediction(rows: Sequence[Row], n_models: int) -> bool | None:
+    """Return whether the first model was right in the run; None if that is not stored.
+
+    Args:
+        rows: rows of one image, with steps in the order of the models.
+        n_models: number of models of the sweep.
+    """
+    return next((row.correct for row in rows if row.step % n_models == 0), None)
 
 
 def _read_sweep_rows(folder: Path, n_models: int) -> dict[int, list[Row]]:
@@ -237,41 +286,66 @@ def _render_attack(
     summary = load_attack_summary(folder)
     parts = load_parts_of_run(folder)
     problem, _ = make_problem_with_warnings(parts)
-    # The configuration u of the trials, by the kind of their rows. The search starts at
-    # the clean scene.
+    configuration_of_kind = _read_trial_configurations(folder, summary, problem)
+    # without conditions, trials of a scene differ in noise only
+    max_trials = None if problem.conditions else 1
+    rows = list[Row]()
+    for kind in configuration_of_kind:
+        rows += _read_trials(folder, kind, every)[:max_trials]
+    progress.stage("rendering pictures", len(rows))
+    for row in rows:
+        yield _render_trial(parts, problem, row, configuration_of_kind[row.kind])
+        progress.advance(1)
+
+
+def _read_trial_configurations(
+    folder: Path, summary: AttackSummary, problem: Problem
+) -> dict[str, Tensor]:
+    """Return the configuration u (d,) of an attack's trials, by the kind of their rows.
+
+    Args:
+        folder: folder of the run.
+        summary: result of the run.
+        problem: its problem.
+    """
+    # The search starts at the clean scene.
     configuration_of_kind = dict.fromkeys(CLEAN_KINDS, problem.domain.start)
     if summary.adversarial is not None:
         # `adversarial_from` is set if a baseline, and not the search, found the
         # adversarial scene.
         kind = "baseline verification" if summary.adversarial_from else "verification"
         configuration_of_kind[kind] = read_stored_configuration(folder, problem)
-    rows = list[Row]()
-    for kind in configuration_of_kind:
-        trials = _read_trials(folder, kind, every)
-        if not problem.conditions:
-            trials = trials[:1]  # they differ in noise only
-        rows += trials
-    progress.stage("rendering pictures", len(rows))
-    for row in rows:
-        u = configuration_of_kind[row.kind]
-        seed = max(0, row.seed or 0)  # a row may lack its seed
-        # a row may lack its samples, too
-        picture = problem.picture(u, seed, row.spp or problem.search_spp)
-        # `u` followed by the conditions that the seed samples
-        full_u = problem.make_full_configuration(u, seed)
-        is_right = problem.judge(picture, full_u).right
-        yield RenderedRow(
-            name=f"{row.kind.replace(' ', '-')}-{row.step:02d}",
-            picture=picture,
-            task=problem.task,
-            facts=make_object_facts(parts.scene, parts.config.object, parts.config),
-            renderer=problem.renderer,
-            u=full_u,
-            rows=[row],
-            values={**problem.describe(u, seed), **row.values},
-            is_reproduced=row.correct in (None, is_right),
-        )
-        progress.advance(1)
+    return configuration_of_kind
+
+
+def _render_trial(
+    parts: AttackParts, problem: Problem, row: Row, u: Tensor
+) -> RenderedRow:
+    """Render one trial of an attack again.
+
+    Args:
+        parts: scene, model and settings of the run.
+        problem: its problem.
+        row: stored prediction of the trial.
+        u: (d,), the configuration of the trial.
+    """
+    seed = max(0, row.seed or 0)  # a row may lack its seed
+    # a row may lack its samples, too
+    picture = problem.picture(u, seed, row.spp or problem.search_spp)
+    # `u` followed by the conditions that the seed samples
+    full_u = problem.make_full_configuration(u, seed)
+    is_right = problem.judge(picture, full_u).right
+    return RenderedRow(
+        name=f"{row.kind.replace(' ', '-')}-{row.step:02d}",
+        picture=picture,
+        task=problem.task,
+        facts=make_object_facts(parts.scene, parts.config.object, parts.config),
+        renderer=problem.renderer,
+        u=full_u,
+        rows=[row],
+        values={**problem.describe(u, seed), **row.values},
+        is_reproduced=row.correct in (None, is_right),
+    )
 
 
 def _read_trials(folder: Path, kind: str, every: bool) -> list[Row]:

@@ -5,7 +5,7 @@ commands, flags, names and files.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from advsearch.cli import output
@@ -60,44 +60,71 @@ def completion(args: argparse.Namespace) -> int:
     Returns:
         The exit status.
     """
-    try:
-        import shtab  # an optional extra
-    except ImportError as error:
-        raise InputError(
-            "completion needs the package shtab; install it with: pip install shtab"
-        ) from error
+    shtab = _import_shtab()
     parser, commands = make_parser_without_commands()
-    # An installation may lack a kind of names; then `REGISTRIES` does, too.
-    names_of_kind = {
-        kind: sorted(list_names(kind))
-        for kind in KIND_OF_FLAG.values()
-        if kind in REGISTRIES
-    }
-    # shtab reads from each argument of the parser how to complete it
+    names_of_kind = _list_names_of_kinds()
     for name in list_commands():
         command_parser = add_command(commands, name)
         for action in command_parser._actions:
-            takes_no_value = action.nargs == 0
-            has_choices = action.choices is not None  # which shtab completes itself
-            if takes_no_value or has_choices:
-                continue
-            # The last one is the long form, "--json". A positional argument has none.
-            flag = action.option_strings[-1] if action.option_strings else ""
-            names = names_of_kind.get(KIND_OF_FLAG.get(flag, ""))
-            if names and flag not in NAME_OR_FILE_FLAGS:
-                action.choices = names
-                continue
-            completer: dict[str, Any] = shtab.FILE  # completes names of files
-            if names:
-                completer = _complete_name_or_file(flag, names)
-            # shtab reads this attribute
-            action.complete = completer  # type: ignore[attr-defined]
+            _set_completion(action, names_of_kind, shtab.FILE)
     script = shtab.complete(parser, shell=args.shell)
     return output.print_answer(
         args.json,
         {"command": "completion", "shell": args.shell, "script": script},
         script,
     )
+
+
+def _import_shtab() -> Any:
+    """Return the module shtab, which an installation may lack.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        import shtab  # an optional extra
+    except ImportError as error:
+        raise InputError(
+            "completion needs the package shtab; install it with: pip install shtab"
+        ) from error
+    return shtab
+
+
+def _list_names_of_kinds() -> dict[str, list[str]]:
+    """Return the sorted names of each kind in `KIND_OF_FLAG`."""
+    # An installation may lack a kind of names; then `REGISTRIES` does, too.
+    return {
+        kind: sorted(list_names(kind))
+        for kind in KIND_OF_FLAG.values()
+        if kind in REGISTRIES
+    }
+
+
+def _set_completion(
+    action: argparse.Action,
+    names_of_kind: Mapping[str, Sequence[str]],
+    file_completer: dict[str, Any],
+) -> None:
+    """Store in an argument of a parser how shtab completes it.
+
+    Args:
+        action: the argument, which is changed.
+        names_of_kind: the names of each kind in `KIND_OF_FLAG`.
+        file_completer: shtab's code that completes names of files.
+    """
+    takes_no_value = action.nargs == 0
+    has_choices = action.choices is not None  # which shtab completes itself
+    if takes_no_value or has_choices:
+        return
+    # The last one is the long form, "--json". A positional argument has none.
+    flag = action.option_strings[-1] if action.option_strings else ""
+    names = names_of_kind.get(KIND_OF_FLAG.get(flag, ""))
+    if names and flag not in NAME_OR_FILE_FLAGS:
+        action.choices = names
+        return
+    completer = _complete_name_or_file(flag, names) if names else file_completer
+    # shtab reads this attribute
+    action.complete = completer  # type: ignore[attr-defined]
 
 
 def _complete_name_or_file(flag: str, names: Sequence[str]) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from advsearch.catalog import is_module_installed
@@ -76,14 +77,7 @@ def dashboard(args: argparse.Namespace) -> int:
     """
     if not 0 <= args.port <= 65535:
         raise InputError(f"--port: expected a number from 0 to 65535, got {args.port}")
-    # Corrupt runs are allowed: the list of runs states the fault of each.
-    runs = [find_run(name, checked=False) for name in args.runs]
-    # PHOTOGRAPH_PAGES is "module:function"; an installation may lack the module
-    has_photographs = is_module_installed(PHOTOGRAPH_PAGES.partition(":")[0])
-    photographs = load_attribute(PHOTOGRAPH_PAGES)() if has_photographs else None
-    server = Dashboard(
-        runs, args.host, args.port, https=args.https, photographs=photographs
-    )
+    server = _open_server(args)
     facts = {
         "address": server.address,
         "token": server.token,
@@ -92,6 +86,28 @@ def dashboard(args: argparse.Namespace) -> int:
     output.print_answer(args.json, {"command": "dashboard", **facts}, server.address)
     # Output may be buffered: a program that waits for the address has to get it now.
     sys.stdout.flush()
+    _print_advice(server)
+    try:
+        server.serve_forever()
+    finally:
+        server.server_close()
+    return 0
+
+
+def _open_server(args: argparse.Namespace) -> Dashboard:
+    """Return the server of the runs that a command line names, at its address."""
+    # Corrupt runs are allowed: the list of runs states the fault of each.
+    runs = [find_run(name, checked=False) for name in args.runs]
+    # PHOTOGRAPH_PAGES is "module:function"; an installation may lack the module
+    has_photographs = is_module_installed(PHOTOGRAPH_PAGES.partition(":")[0])
+    photographs = load_attribute(PHOTOGRAPH_PAGES)() if has_photographs else None
+    return Dashboard(
+        runs, args.host, args.port, https=args.https, photographs=photographs
+    )
+
+
+def _print_advice(server: Dashboard) -> None:
+    """Print on standard error what a user of a server has to know."""
     if server.fingerprint:  # it speaks HTTPS
         print(
             "The browser will warn of the certificate, which was made for this server "
@@ -105,11 +121,6 @@ def dashboard(args: argparse.Namespace) -> int:
         advice = f"For a code to point a phone at: {NO_QR}"
         print(qr_code or advice, file=sys.stderr)
     print("Ctrl-C ends it.", file=sys.stderr)
-    try:
-        server.serve_forever()
-    finally:
-        server.server_close()
-    return 0
 
 
 @command(
@@ -137,17 +148,32 @@ def view(args: argparse.Namespace) -> int:
         InputError: several runs were given without a folder.
     """
     folders = [find_run(name) for name in args.runs]
-    if args.bundle is None and len(folders) > 1:
-        raise InputError(
-            "--bundle: pages of several runs go into a folder; name one, "
-            "or give one run"
-        )
-    if args.bundle is None:
-        out = write_page(folders[0])
-    else:
-        out = write_bundle(folders, Path(args.bundle))
+    out = _write_pages(folders, args.bundle)
     return output.print_answer(
         args.json,
         {"command": "view", "runs": list(map(str, folders)), "out": str(out)},
         str(out),
     )
+
+
+def _write_pages(folders: Sequence[Path], bundle: str | None) -> Path:
+    """Write the page of one run into its folder, or those of several into another one.
+
+    Args:
+        folders: the runs.
+        bundle: the folder for the pages; None for the folder of the only run.
+
+    Returns:
+        The file or folder that was written.
+
+    Raises:
+        InputError: there are several runs and no folder.
+    """
+    if bundle is not None:
+        return write_bundle(folders, Path(bundle))
+    if len(folders) > 1:
+        raise InputError(
+            "--bundle: pages of several runs go into a folder; name one, "
+            "or give one run"
+        )
+    return write_page(folders[0])

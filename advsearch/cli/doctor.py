@@ -23,6 +23,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib import metadata, resources
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from advsearch import threads
 from advsearch.cli import output
@@ -31,6 +32,9 @@ from advsearch.errors import FELL_SHORT, AdvsearchError
 from advsearch.scene.mitsuba_backend import llvm
 from advsearch.trust.code import SUBPROCESS_DIRECTORY
 from advsearch.version import __version__
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 OK = "ok"
 WARNING = "warning"
@@ -90,17 +94,22 @@ def doctor(args: argparse.Namespace) -> int:
     parts = diagnose()
     is_good = all(part.status in (OK, WARNING) for part in parts)
     if args.json:
-        output.print_json(
-            {
-                "schema": 1,
-                "command": "doctor",
-                "ok": is_good,
-                "parts": [asdict(part) for part in parts],
-            }
-        )
+        _print_parts_as_json(parts, is_good=is_good)
     else:
         _print_parts(parts, is_good=is_good)
     return 0 if is_good else FELL_SHORT
+
+
+def _print_parts_as_json(parts: Sequence[Component], *, is_good: bool) -> None:
+    """Print the components, and whether all that is necessary works, as JSON."""
+    output.print_json(
+        {
+            "schema": 1,
+            "command": "doctor",
+            "ok": is_good,
+            "parts": [asdict(part) for part in parts],
+        }
+    )
 
 
 def _print_parts(parts: Sequence[Component], *, is_good: bool) -> None:
@@ -113,18 +122,9 @@ def _print_parts(parts: Sequence[Component], *, is_good: bool) -> None:
     # late: without rich, --json still works and reports it
     from rich.console import Console
     from rich.markup import escape
-    from rich.table import Table
 
     console = Console(highlight=False)
-    table = Table(box=None, pad_edge=False)
-    for heading in ("part", "version", "", "detail"):
-        table.add_column(heading, overflow="fold")
-    for part in parts:
-        state = f"[{COLOURS[part.status]}]{part.status}[/]"
-        table.add_row(
-            escape(part.name), escape(part.version), state, escape(part.detail)
-        )
-    console.print(table)
+    console.print(_make_parts_table(parts))
     console.print()
     for part in parts:
         if part.fix:
@@ -133,6 +133,23 @@ def _print_parts(parts: Sequence[Component], *, is_good: bool) -> None:
         console.print("Everything that is necessary works.")
     else:
         console.print("[red]Something necessary does not work.[/]")
+
+
+def _make_parts_table(parts: Sequence[Component]) -> Table:
+    """Return a table with a row for each component."""
+    # late: rich may be missing
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    for heading in ("part", "version", "", "detail"):
+        table.add_column(heading, overflow="fold")
+    for part in parts:
+        state = f"[{COLOURS[part.status]}]{part.status}[/]"
+        table.add_row(
+            escape(part.name), escape(part.version), state, escape(part.detail)
+        )
+    return table
 
 
 def diagnose() -> list[Component]:
@@ -195,14 +212,19 @@ def _run_probe_process(command: Sequence[str]) -> tuple[str, bool, str]:
             cwd=SUBPROCESS_DIRECTORY,
         )
     except subprocess.TimeoutExpired as expired:
-        # After a timeout the output is bytes even with `text=True`, or None.
-        partial_output = expired.stdout or ""
-        if isinstance(partial_output, bytes):
-            partial_output = partial_output.decode("utf-8", "replace")
         ending = f"the trial took longer than {SECONDS_ALLOWED} s"
-        return partial_output, False, ending
+        return _decode_partial_output(expired), False, ending
     ending = _describe_ending(process.returncode, process.stderr)
     return process.stdout, process.returncode == 0, ending
+
+
+def _decode_partial_output(expired: subprocess.TimeoutExpired) -> str:
+    """Return what a process wrote to standard output before its time was over."""
+    # After a timeout the output is bytes even with `text=True`, or None.
+    partial_output: str | bytes = expired.stdout or ""
+    if isinstance(partial_output, bytes):
+        return partial_output.decode("utf-8", "replace")
+    return partial_output
 
 
 def _describe_ending(status: int, error_text: str) -> str:
@@ -248,24 +270,27 @@ def check_packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
         "mitsuba-oidn",
         *_SMALL_PACKAGES,
     ):
-        # "render" is no package and has no version; None is a missing package
-        version = "" if name == "render" else find_installed_version(name)
-        if version is None:
-            yield _make_missing_package(name)
-        elif name in ("mitsuba", "drjit"):
-            yield Component(name, version, OK, "tried by the render below")
-        elif name not in tried:
-            # The process of the trials crashed before or at this one, usually because
-            # libLLVM is too old.
-            _ended_well, process_ending = tried[PROBE_PROCESS]
-            detail = f"not reached: {process_ending}"
-            yield Component(name, version, BROKEN, detail, "see libLLVM below")
-        else:
-            is_working, detail = tried[name]
-            if is_working:
-                yield Component(name, version, OK, detail)
-            else:
-                yield _make_broken_package(name, version, detail)
+        yield _check_probed_package(name, tried)
+
+
+def _check_probed_package(name: str, tried: dict[str, tuple[bool, str]]) -> Component:
+    """Return the entry of one package, or of "render"; `tried` as `check_packages`."""
+    # "render" is no package and has no version; None is a missing package
+    version = "" if name == "render" else find_installed_version(name)
+    if version is None:
+        return _make_missing_package(name)
+    if name in ("mitsuba", "drjit"):
+        return Component(name, version, OK, "tried by the render below")
+    if name not in tried:
+        # The process of the trials crashed before or at this one, usually because
+        # libLLVM is too old.
+        _ended_well, process_ending = tried[PROBE_PROCESS]
+        detail = f"not reached: {process_ending}"
+        return Component(name, version, BROKEN, detail, "see libLLVM below")
+    is_working, detail = tried[name]
+    if is_working:
+        return Component(name, version, OK, detail)
+    return _make_broken_package(name, version, detail)
 
 
 def _make_missing_package(name: str) -> Component:
@@ -294,29 +319,32 @@ def check_other_packages(requirements: Sequence[str] | None = None) -> Component
     """
     if requirements is None:
         requirements = metadata.requires("advsearch") or []
+    untried_names = _list_untried_packages(requirements)
+    versions = {name: find_installed_version(name) for name in untried_names}
+    absent = [name for name, version in versions.items() if version is None]
+    if absent:
+        detail = f"not installed: {', '.join(absent)}"
+        fix = _reinstall(" ".join(absent))
+        return Component("other packages", "", MISSING, detail, fix)
+    detail = ", ".join(f"{name} {version}" for name, version in versions.items())
+    return Component("other packages", "", OK, detail)
+
+
+def _list_untried_packages(requirements: Sequence[str]) -> list[str]:
+    """Return the sorted names of required packages that no trial imports.
+
+    Args:
+        requirements: as in a package's metadata, for example "rich>=13"; those of
+            optional extras are left out.
+    """
     names = {
         # "rich>=13" and 'tomli; python_version < "3.11"' begin with the name
         re.split(r"[^\w.-]", requirement, maxsplit=1)[0]
         for requirement in requirements
         if "extra ==" not in requirement  # the package belongs to no optional extra
     }
-    untried_names = sorted(
-        names - {"numpy", "torch", "mitsuba", "mitsuba-oidn", *_SMALL_PACKAGES},
-        key=str.lower,
-    )
-    versions = {name: find_installed_version(name) for name in untried_names}
-    absent = [name for name, version in versions.items() if version is None]
-    if absent:
-        detail = f"not installed: {', '.join(absent)}"
-        return Component(
-            "other packages", "", MISSING, detail, _reinstall(" ".join(absent))
-        )
-    return Component(
-        "other packages",
-        "",
-        OK,
-        ", ".join(f"{name} {version}" for name, version in versions.items()),
-    )
+    tried_names = {"numpy", "torch", "mitsuba", "mitsuba-oidn", *_SMALL_PACKAGES}
+    return sorted(names - tried_names, key=str.lower)
 
 
 def find_installed_version(name: str) -> str | None:
@@ -346,30 +374,46 @@ def check_llvm() -> Component:
     try:
         chosen = llvm.ensure_llvm()
     except AdvsearchError as error:
-        if library_setting:
-            fix = f"unset {llvm.ENVIRONMENT_VARIABLE}"
-        else:
-            fix = (
-                f"{llvm.get_install_command()} (or name a file in "
-                f"{llvm.ENVIRONMENT_VARIABLE})"
-            )
         status = BROKEN if libraries or library_setting else MISSING
+        fix = _make_llvm_fix(library_setting)
         return Component("libLLVM", "", status, str(error), fix)
+    detail = f"chosen: {chosen.path}"
+    if library_setting:
+        detail += f", named by {llvm.ENVIRONMENT_VARIABLE}"
+    detail += _describe_other_libraries(libraries, chosen.path)
+    return Component("libLLVM", ".".join(map(str, chosen.version)), OK, detail)
+
+
+def _make_llvm_fix(library_setting: str) -> str:
+    """Return how to repair a libLLVM that is missing or does not work.
+
+    Args:
+        library_setting: the library that the environment variable names, or "".
+    """
+    if library_setting:
+        return f"unset {llvm.ENVIRONMENT_VARIABLE}"
+    return (
+        f"{llvm.get_install_command()} (or name a file in {llvm.ENVIRONMENT_VARIABLE})"
+    )
+
+
+def _describe_other_libraries(
+    libraries: Sequence[llvm.LibraryFile], chosen: Path
+) -> str:
+    """Return the usable and the refused libraries but the chosen one, as clauses."""
     # the text of a library has the reason for which it is refused
     refused = [str(library) for library in libraries if library.refusal]
     other_usable = [
         str(library)
         for library in libraries
-        if not library.refusal and library.path != chosen.path.resolve()
+        if not library.refusal and library.path != chosen.resolve()
     ]
-    detail = f"chosen: {chosen.path}"
-    if library_setting:
-        detail += f", named by {llvm.ENVIRONMENT_VARIABLE}"
+    text = ""
     if other_usable:
-        detail += f"; also usable: {', '.join(other_usable)}"
+        text += f"; also usable: {', '.join(other_usable)}"
     if refused:
-        detail += f"; refused: {', '.join(refused)}"
-    return Component("libLLVM", ".".join(map(str, chosen.version)), OK, detail)
+        text += f"; refused: {', '.join(refused)}"
+    return text
 
 
 def check_bundled_scenes() -> Component:
@@ -392,23 +436,19 @@ def check_bundled_scenes() -> Component:
 
 def check_reference_weights() -> Component:
     """Check the weights and labels of the bundled classifier."""
+    name = "reference model"
     folder = resources.files("advsearch.models") / "data"
     absent = [
-        name
-        for name in ("reference.safetensors", "reference.json")
-        if not folder.joinpath(name).is_file()
+        file_name
+        for file_name in ("reference.safetensors", "reference.json")
+        if not folder.joinpath(file_name).is_file()
     ]
     if absent:
         fix = "reinstall advsearch; in a checkout: git restore advsearch/models/data"
-        return Component(
-            "reference model",
-            "",
-            MISSING,
-            f"{' and '.join(absent)} not in {folder}",
-            fix,
-        )
+        detail = f"{' and '.join(absent)} not in {folder}"
+        return Component(name, "", MISSING, detail, fix)
     size = os.path.getsize(str(folder.joinpath("reference.safetensors")))
-    return Component("reference model", "", OK, f"{size / 1e6:.1f} MB of weights")
+    return Component(name, "", OK, f"{size / 1e6:.1f} MB of weights")
 
 
 def check_kernel_cache(folder: Path) -> Component:
@@ -424,10 +464,9 @@ def check_kernel_cache(folder: Path) -> Component:
             "its kernels again"
         )
         return Component(name, "", WARNING, detail, f"make {folder} writable")
-    files = [entry.stat().st_size for entry in os.scandir(folder) if entry.is_file()]
-    return Component(
-        name, "", OK, f"{folder}: {len(files)} files, {sum(files) / 1e6:.0f} MB"
-    )
+    sizes = [entry.stat().st_size for entry in os.scandir(folder) if entry.is_file()]
+    detail = f"{folder}: {len(sizes)} files, {sum(sizes) / 1e6:.0f} MB"
+    return Component(name, "", OK, detail)
 
 
 def check_disk(folder: Path) -> Component:
@@ -444,19 +483,19 @@ def check_disk(folder: Path) -> Component:
 def check_hardware() -> Component:
     """Check cores and memory; little memory is a warning."""
     cores = threads.count_cores()
-    memory = 0  # in bytes; stays 0 on systems that do not report it
-    with suppress(AttributeError, ValueError, OSError):
-        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    memory = _read_memory_size()
     cores_text = f"{cores} cores" if cores > 1 else f"{cores} core"
     detail = f"{platform.system()} {platform.machine()}, {cores_text}"
     if memory:
         detail += f", {memory / GIB:.1f} GiB of memory"
     if memory and memory < MIN_MEMORY:
-        return Component(
-            "machine",
-            "",
-            WARNING,
-            detail,
-            "a search peaks at 2.5 GiB: close other programs",
-        )
+        fix = "a search peaks at 2.5 GiB: close other programs"
+        return Component("machine", "", WARNING, detail, fix)
     return Component("machine", "", OK, detail)
+
+
+def _read_memory_size() -> int:
+    """Return the bytes of memory; 0 on systems that do not report them."""
+    with suppress(AttributeError, ValueError, OSError):
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return 0

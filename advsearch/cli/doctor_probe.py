@@ -46,6 +46,36 @@ def probe_renderer() -> str:
     mi = import_mitsuba()
     import drjit as dr  # what is probed
 
+    brightness, slope = _render_wall(mi, dr)
+    _check_wall(brightness, slope)
+    version = ".".join(map(str, dr.detail.llvm_version()))
+    return (
+        f"{PIXELS} x {PIXELS} pixels and their gradient, {VARIANT}, LLVM {version}, "
+        f"{dr.thread_count()} threads"
+    )
+
+
+def _check_wall(brightness: float, slope: float) -> None:
+    """Check the brightness of the wall, and its derivative by the reflectance.
+
+    Raises:
+        ArithmeticError: they differ from 0.5 and 1 by more than noise.
+    """
+    is_brightness_right = abs(brightness - 0.5) < NOISE
+    is_slope_right = abs(slope - 1.0) < 2 * NOISE
+    if not (is_brightness_right and is_slope_right):
+        raise ArithmeticError(
+            f"expected brightness 0.5 and slope 1, got {brightness:.4f} and {slope:.4f}"
+        )
+
+
+def _render_wall(mi: Any, dr: Any) -> tuple[float, float]:
+    """Return the mean brightness of the wall, and its derivative by the reflectance.
+
+    Args:
+        mi: the module of Mitsuba.
+        dr: the module of Dr.Jit.
+    """
     scene = mi.load_dict(_describe_wall(mi), optimize=False)
     parameters = mi.traverse(scene)
     key = "wall.bsdf.reflectance.value"
@@ -54,18 +84,7 @@ def probe_renderer() -> str:
     dr.backward(dr.mean(image, axis=None))
     brightness = float(image.numpy().mean())
     slope = float(dr.sum(dr.grad(parameters[key])).numpy().sum())
-    is_brightness_right = abs(brightness - 0.5) < NOISE
-    is_slope_right = abs(slope - 1.0) < 2 * NOISE
-    if not (is_brightness_right and is_slope_right):
-        raise ArithmeticError(
-            f"expected brightness 0.5 and slope 1, got {brightness:.4f} and {slope:.4f}"
-        )
-    version = ".".join(map(str, dr.detail.llvm_version()))
-    return (
-        f"{PIXELS} x {PIXELS} pixels and their gradient, {VARIANT}, LLVM "
-        f"{version}, "
-        f"{dr.thread_count()} threads"
-    )
+    return brightness, slope
 
 
 def _describe_wall(mi: Any) -> dict[str, Any]:
@@ -78,6 +97,22 @@ def _describe_wall(mi: Any) -> dict[str, Any]:
         "type": "rectangle",
         "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}},
     }
+    return {
+        "type": "scene",
+        "wall": wall,
+        "sensor": _describe_wall_sensor(mi),
+        "light": {"type": "constant"},
+        # depth 2: light that is reflected once
+        "integrator": {"type": "prb", "max_depth": 2},
+    }
+
+
+def _describe_wall_sensor(mi: Any) -> dict[str, Any]:
+    """Return a camera for Mitsuba that looks at the wall from a distance of 2.
+
+    Args:
+        mi: the module of Mitsuba.
+    """
     film = {
         "type": "hdrfilm",
         "width": PIXELS,
@@ -87,17 +122,7 @@ def _describe_wall(mi: Any) -> dict[str, Any]:
     view = mi.ScalarTransform4f().look_at(
         origin=[0, 0, 2], target=[0, 0, 0], up=[0, 1, 0]
     )
-    sensor = {"type": "perspective", "fov": 30, "to_world": view, "film": film}
-    light = {"type": "constant"}
-    # depth 2: light that is reflected once
-    integrator = {"type": "prb", "max_depth": 2}
-    return {
-        "type": "scene",
-        "wall": wall,
-        "sensor": sensor,
-        "light": light,
-        "integrator": integrator,
-    }
+    return {"type": "perspective", "fov": 30, "to_world": view, "film": film}
 
 
 def probe_denoiser() -> str:
@@ -149,19 +174,20 @@ def main() -> int:
     error, the next ones still run.
     """
     for name, trial in TRIALS.items():
-        # Standard output is for the lines of JSON. What a library prints is dropped.
-        discarded_output = io.StringIO()
-        try:
-            with contextlib.redirect_stdout(discarded_output):
-                outcome = {"name": name, "ok": True, "detail": trial()}
-        except Exception as error:
-            outcome = {
-                "name": name,
-                "ok": False,
-                "detail": f"{type(error).__name__}: {error}",
-            }
-        print(json.dumps(outcome), flush=True)
+        print(json.dumps(_run_trial(name, trial)), flush=True)
     return 0
+
+
+def _run_trial(name: str, trial: Callable[[], str]) -> dict[str, str | bool]:
+    """Return the name of a component, whether it works, and a detail or the error."""
+    # Standard output is for the lines of JSON. What a library prints is dropped.
+    discarded_output = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(discarded_output):
+            return {"name": name, "ok": True, "detail": trial()}
+    except Exception as error:
+        detail = f"{type(error).__name__}: {error}"
+        return {"name": name, "ok": False, "detail": detail}
 
 
 if __name__ == "__main__":

@@ -103,6 +103,20 @@ def export(args: argparse.Namespace) -> int:
     is_table = format in FORMATS or format not in EXPORTERS
     if is_table:
         return _write_table(args, out, file_suffix)
+    return _write_other_format(args, out, format)
+
+
+def _write_other_format(args: argparse.Namespace, out: Path | None, format: str) -> int:
+    """Write a run in a format that is no table, and return the exit status.
+
+    Args:
+        args: arguments of the command.
+        out: the file or folder to write; None without ``--out``, which is an error.
+        format: name of an exporter.
+
+    Raises:
+        InputError: a flag is missing, or does not belong to the format.
+    """
     exporter = EXPORTERS[format]()
     if out is None:  # all but tables are files or folders, which nothing can print
         raise InputError(f"--out: {format} writes {exporter.writes}; give its name")
@@ -155,11 +169,7 @@ def _choose_format(
         InputError: ``--format`` names a format that was removed.
         UnknownNameError: ``--format`` names no format.
     """
-    format_of_suffix = {table: table for table in FORMATS}
-    for name, exporter in usable.items():
-        # setdefault: an exporter of another package gets no suffix that is taken
-        format_of_suffix.setdefault(exporter.suffix or name, name)
-    format: str = args.format or format_of_suffix.get(file_suffix, file_suffix)
+    format: str = args.format or _find_format_of_suffix(file_suffix, usable)
     if format == "fiftyone":
         raise InputError(
             "--format: fiftyone was removed, since FiftyOne reads COCO; "
@@ -168,6 +178,17 @@ def _choose_format(
     if args.format and format not in (*EXPORTERS, *FORMATS):
         raise UnknownNameError("format", format, (*EXPORTERS, *FORMATS))
     return format
+
+
+def _find_format_of_suffix(
+    file_suffix: str, usable: Mapping[str, type[Exporter]]
+) -> str:
+    """Return the format of files with a suffix; the suffix itself if there is none."""
+    format_of_suffix = {table: table for table in FORMATS}
+    for name, exporter in usable.items():
+        # setdefault: an exporter of another package gets no suffix that is taken
+        format_of_suffix.setdefault(exporter.suffix or name, name)
+    return format_of_suffix.get(file_suffix, file_suffix)
 
 
 def _write_table(args: argparse.Namespace, out: Path | None, file_suffix: str) -> int:
@@ -185,29 +206,10 @@ def _write_table(args: argparse.Namespace, out: Path | None, file_suffix: str) -
         InputError: flags contradict each other, or the run is a study without rows.
     """
     format = args.format or _choose_table_format(args, out, file_suffix)
-    if args.json and out is None and format != "json":
-        raise InputError(
-            f"--json: prints JSON, but --format asks for {format}; leave "
-            "one of them out"
-        )
-    if out is not None and os.path.isdir(out):
-        raise InputError(f"--out: expected the name of a file, got the folder {out}")
+    _check_table_target(args, out, format)
     folder = find_run(args.run)
-    if (folder / PARTS).is_dir():
-        parts = ", ".join(map(str, sorted((folder / PARTS).iterdir())))
-        raise InputError(
-            f"{folder}: is a study, whose rows are those of its parts; "
-            f"export one of {parts}"
-        )
-    # For a terminal the table goes through `print`, which escapes control characters;
-    # else it is written as it is.
-    is_for_terminal = out is None and sys.stdout.isatty()
-    buffer = io.BytesIO()
-    stream = buffer if is_for_terminal else sys.stdout.buffer
-    with Store(folder / NAME, read_only=True) as store, output_errors():
-        count = write_rows(store, format, out, stream, args.kind)
-    if is_for_terminal:
-        print(buffer.getvalue().decode("utf-8", "replace"), end="")
+    _check_no_study(folder)
+    count = _write_or_print_rows(folder, format, out, args.kind)
     if out is None:
         return output.OK
     text = f"{count} rows in {out}"
@@ -215,6 +217,60 @@ def _write_table(args: argparse.Namespace, out: Path | None, file_suffix: str) -
         text += f", as {format}"
     facts = {"command": "export", "rows": count, "format": format, "out": str(out)}
     return output.print_answer(args.json, facts, text, sys.stderr)
+
+
+def _check_table_target(
+    args: argparse.Namespace, out: Path | None, format: str
+) -> None:
+    """Check that a table in this format can be written to a file, or printed.
+
+    Raises:
+        InputError: JSON is to be printed in another format, or the file is a folder.
+    """
+    if args.json and out is None and format != "json":
+        raise InputError(
+            f"--json: prints JSON, but --format asks for {format}; leave "
+            "one of them out"
+        )
+    if out is not None and os.path.isdir(out):
+        raise InputError(f"--out: expected the name of a file, got the folder {out}")
+
+
+def _check_no_study(folder: Path) -> None:
+    """Check that a run has rows of its own.
+
+    Raises:
+        InputError: it is a study, whose rows are in its parts.
+    """
+    if (folder / PARTS).is_dir():
+        parts = ", ".join(map(str, sorted((folder / PARTS).iterdir())))
+        raise InputError(
+            f"{folder}: is a study, whose rows are those of its parts; "
+            f"export one of {parts}"
+        )
+
+
+def _write_or_print_rows(
+    folder: Path, format: str, out: Path | None, kind: str | None
+) -> int:
+    """Write the rows of a run as a table, and return their number.
+
+    Args:
+        folder: the run.
+        format: one of `FORMATS`.
+        out: the file; None prints the table.
+        kind: kind of the rows; None for all.
+    """
+    # For a terminal the table goes through `print`, which escapes control characters;
+    # else it is written as it is.
+    is_for_terminal = out is None and sys.stdout.isatty()
+    buffer = io.BytesIO()
+    stream = buffer if is_for_terminal else sys.stdout.buffer
+    with Store(folder / NAME, read_only=True) as store, output_errors():
+        count = write_rows(store, format, out, stream, kind)
+    if is_for_terminal:
+        print(buffer.getvalue().decode("utf-8", "replace"), end="")
+    return count
 
 
 def _choose_table_format(

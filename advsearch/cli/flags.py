@@ -59,20 +59,25 @@ def add_settings(
             continue
         if setting.group not in headings:
             headings[setting.group] = parser.add_argument_group(setting.group)
-        # SUPPRESS: a flag that was not given is absent from the arguments
-        add = partial(headings[setting.group].add_argument, default=argparse.SUPPRESS)
-        if setting.field == "object":
-            # --scene is a flag but no setting: with it, the values of --object are
-            # names in the scene file. The help lists it before --object.
-            add("--scene", metavar="FILE", help=SCENE_HELP)
-        options: dict[str, Any] = {
-            "action": "append" if setting.repeats else "store",
-            "metavar": setting.metavar,
-        }
-        if setting.is_switch:
-            # a flag without a value, which sets the opposite of the default
-            options = {"action": "store_const", "const": not setting.default}
-        add(setting.flag, dest=setting.field, help=format_help(setting), **options)
+        _add_setting(headings[setting.group], setting)
+
+
+def _add_setting(group: argparse._ArgumentGroup, setting: Setting) -> None:
+    """Add the flag of a setting to the help's group; with --object also --scene."""
+    # SUPPRESS: a flag that was not given is absent from the arguments
+    add = partial(group.add_argument, default=argparse.SUPPRESS)
+    if setting.field == "object":
+        # --scene is a flag but no setting: with it, the values of --object are names
+        # in the scene file. The help lists it before --object.
+        add("--scene", metavar="FILE", help=SCENE_HELP)
+    options: dict[str, Any] = {
+        "action": "append" if setting.repeats else "store",
+        "metavar": setting.metavar,
+    }
+    if setting.is_switch:
+        # a flag without a value, which sets the opposite of the default
+        options = {"action": "store_const", "const": not setting.default}
+    add(setting.flag, dest=setting.field, help=format_help(setting), **options)
 
 
 def make_config(
@@ -94,22 +99,35 @@ def make_config(
         if setting.field in args
     }
     data = {**defaults, **typed}
-    if "scene" in args and data.get("object") is None:
-        raise InputError(
-            f"object: expected something in {args.scene}, got nothing; "
-            f"name one of {_format_object_names(args.scene)}"
-        )
-    if "scene" in args and isinstance(data.get("object"), str):
-        # names of objects are those in the scene file: FILE#NAME
-        data["object"] = ",".join(
-            f"{args.scene}#{name}" for name in split_names(data["object"])
-        )
+    if "scene" in args:
+        data["object"] = _prefix_with_scene_file(data.get("object"), args.scene)
     config = config_type(**data)
     # Python code that these settings name may run, since the user typed them. Those in
     # `defaults` come from the file of a run; code in them needs --code. The
     # configuration is made first, since it parses the strings of the flags.
     allow_code_in_settings({name: getattr(config, name) for name in typed})
     return config
+
+
+def _prefix_with_scene_file(object_names: Any, scene: str) -> Any:
+    """Return the names of objects as those in a scene file: ``FILE#NAME``.
+
+    Args:
+        object_names: the value of ``--object``: names with commas in between. Other
+            values are returned as they are.
+        scene: the scene file.
+
+    Raises:
+        InputError: the value is None.
+    """
+    if object_names is None:
+        raise InputError(
+            f"object: expected something in {scene}, got nothing; "
+            f"name one of {_format_object_names(scene)}"
+        )
+    if isinstance(object_names, str):
+        return ",".join(f"{scene}#{name}" for name in split_names(object_names))
+    return object_names
 
 
 def read_command(file: str | Path) -> str:
@@ -149,15 +167,9 @@ def _format_object_names(scene: str) -> str:
     """
     # late, so that --help answers at once
     from advsearch.scene.importing.files import format_name
-    from advsearch.scene.importing.scenes import MITSUBA_SUFFIX, list_node_names
-    from advsearch.scene.mitsuba_backend.scene_files import read_contents
 
     path = Path(scene)
-    names: Sequence[str]
-    if path.suffix.lower() == MITSUBA_SUFFIX:
-        names = read_contents(path).objects
-    else:
-        names = list_node_names(path)
+    names = _list_object_names(path)
     if not names:
         raise InputError(
             f"--scene: {path} has nothing that can be the object; "
@@ -166,6 +178,17 @@ def _format_object_names(scene: str) -> str:
     text = ", ".join(format_name(name, quoted=False) for name in names[:MAX_NAMES])
     n_omitted = len(names) - MAX_NAMES
     return f"{text} or {n_omitted:,} more" if n_omitted > 0 else text
+
+
+def _list_object_names(path: Path) -> Sequence[str]:
+    """Return the names of nodes or shapes in a scene file that can be the object."""
+    # late, so that --help answers at once
+    from advsearch.scene.importing.scenes import MITSUBA_SUFFIX, list_node_names
+    from advsearch.scene.mitsuba_backend.scene_files import read_contents
+
+    if path.suffix.lower() == MITSUBA_SUFFIX:
+        return read_contents(path).objects
+    return list_node_names(path)
 
 
 def format_as_flags(message: str) -> str:
@@ -179,26 +202,38 @@ def format_as_flags(message: str) -> str:
     known = [setting for config in CONFIGS.values() for setting in settings(config)]
     flags = {**_OTHER_FLAGS, **{setting.name: setting.flag for setting in known}}
     switches = {setting.name for setting in known if setting.is_switch}
-
-    def write_flag(match: re.Match[str]) -> str:
-        """Return the flag of a setting, with its value if it takes one."""
-        name = match["name"]
-        value = match["value"]
-        if value is None or name in switches:  # a switch takes no value
-            return flags[name]
-        return f"{flags[name]} {value}"
-
     # A pattern for any known setting. If one name begins with another, both still match
     # correctly: in each use "=", a backtick or ": " has to follow the name.
     names = f"(?P<name>{'|'.join(flags)})"
     # in backticks, perhaps with a value
-    message = re.sub(rf"`{names}(=(?P<value>[^`]*))?`", write_flag, message)
+    message = re.sub(
+        rf"`{names}(=(?P<value>[^`]*))?`",
+        lambda match: _write_flag(match, flags, switches),
+        message,
+    )
     # before a colon, at the beginning of the message or of a clause
     return re.sub(
         rf"(?P<before>^|; ){names}(?=: )",
         lambda match: match["before"] + flags[match["name"]],
         message,
     )
+
+
+def _write_flag(
+    match: re.Match[str], flags: Mapping[str, str], switches: Collection[str]
+) -> str:
+    """Return the flag of a setting in a message, with its value if it takes one.
+
+    Args:
+        match: the setting, with the groups "name" and "value".
+        flags: the flag of each setting.
+        switches: names of settings whose flags take no value.
+    """
+    name = match["name"]
+    value = match["value"]
+    if value is None or name in switches:
+        return flags[name]
+    return f"{flags[name]} {value}"
 
 
 def format_help(setting: Setting) -> str:

@@ -19,6 +19,7 @@ from advsearch.runs.summary import read_result
 
 if TYPE_CHECKING:
     from advsearch.scene.importing.scenes import FileContents
+    from advsearch.scene.mitsuba_backend.scene_files import PluginContents
 
 VIEWS = 4  # number of views in the picture of an object
 SIDE = 192  # width and height of each view in pixels
@@ -58,19 +59,29 @@ def file(args: argparse.Namespace) -> int:
     if out is not None and out.suffix.lower() != ".png":
         raise InputError(f"--out: expected the name of a .png file, got {args.out}")
     with open_answer_progress():
-        # late, so that --help answers at once
-        from advsearch.scene.importing.scenes import MITSUBA_SUFFIX, read_file_contents
-
-        if Path(args.file).suffix.lower() == MITSUBA_SUFFIX:
-            facts, lines = _describe_mitsuba_file(args.file, out)
-        else:
-            contents = read_file_contents(Path(args.file))
-            facts, lines = _describe_mesh_file(args.file, contents)
-            if out is not None:
-                scene = advsearch.load_scene(contents.object)
-                advsearch.render(scene, around=VIEWS, resolution=SIDE).save(out)
+        facts, lines = _describe_and_render_file(args.file, out)
     facts = {"command": "import", "file": args.file, **facts, "out": args.out}
     return output.print_answer(args.json, facts, "\n".join(lines))
+
+
+def _describe_and_render_file(file: str, out: Path | None) -> Understood:
+    """Describe what advsearch reads from a file, and render it if `out` is given.
+
+    Args:
+        file: path of the file, as the user wrote it.
+        out: file of the picture; None renders none.
+    """
+    # late, so that --help answers at once
+    from advsearch.scene.importing.scenes import MITSUBA_SUFFIX, read_file_contents
+
+    if Path(file).suffix.lower() == MITSUBA_SUFFIX:
+        return _describe_mitsuba_file(file, out)
+    contents = read_file_contents(Path(file))
+    understood = _describe_mesh_file(file, contents)
+    if out is not None:
+        scene = advsearch.load_scene(contents.object)
+        advsearch.render(scene, around=VIEWS, resolution=SIDE).save(out)
+    return understood
 
 
 def _describe_mesh_file(file: str, contents: FileContents) -> Understood:
@@ -81,41 +92,62 @@ def _describe_mesh_file(file: str, contents: FileContents) -> Understood:
         contents: the object, nodes, lights and cameras in it.
     """
     mesh_object = contents.object
-    materials = mesh_object.mesh.materials  # indices of the faces of each, by name
-    clips, joints, targets = _list_motions(mesh_object.mesh.rig)
+    motions = _list_motions(mesh_object.mesh.rig)
     slow_features = _explain_slow_features(mesh_object)  # a sentence for each
-    facts = {
+    facts: dict[str, Any] = {
         **_describe_object(mesh_object),
-        "materials": [
-            {"name": name, "triangles": len(faces)} for name, faces in materials.items()
-        ],
+        "materials": _list_materials(mesh_object),
         "nodes": list(map(_describe_node, contents.nodes)),
         "lights": list(contents.lights),
         "cameras": list(contents.cameras),
-        "clips": clips,
-        "joints": joints,
-        "targets": targets,
+        **motions,
         "slow": slow_features,
         "warnings": list(mesh_object.warnings),
     }
-    width, height = facts["texture"]
-    lines = [
-        f"{file}: {facts['triangles']:,} triangles, a texture of {width} x {height}, "
-        f"{facts['up']} up, front {facts['front']}"
-    ]
+    lines = [_format_mesh_summary(file, facts)]
     if contents.nodes:
         lines += _format_nodes(file, contents.nodes)
-    names_by_kind = {
-        "materials (--control 'texture={materials: [NAME]}')": materials,
-        "lights": contents.lights,
-        "cameras (--camera NAME)": contents.cameras,
-        "clips (--control 'body={clip: NAME, time: [0, 1]}')": clips,
-        "joints (--control 'body={NAME.x: [-30, 30]}')": joints,
-        "morph targets (--control 'body={NAME.weight: [0, 1]}')": targets,
-    }
-    lines += _format_names(names_by_kind)
+    lines += _format_names(_name_kinds_of_mesh_file(contents, motions))
     lines += [f"Note: {note}" for note in (*mesh_object.warnings, *slow_features)]
     return facts, lines
+
+
+def _list_materials(mesh_object: Any) -> list[dict[str, Any]]:
+    """Return the name and the number of triangles of each material, for JSON."""
+    return [
+        {"name": name, "triangles": len(faces)}
+        for name, faces in mesh_object.mesh.materials.items()
+    ]
+
+
+def _format_mesh_summary(file: str, facts: Mapping[str, Any]) -> str:
+    """Return a line with the size and orientation of the object in a file."""
+    width, height = facts["texture"]
+    return (
+        f"{file}: {facts['triangles']:,} triangles, a texture of {width} x {height}, "
+        f"{facts['up']} up, front {facts['front']}"
+    )
+
+
+def _name_kinds_of_mesh_file(
+    contents: FileContents, motions: Mapping[str, list[str]]
+) -> dict[str, Iterable[str]]:
+    """Return the names in the file of a mesh, by kinds that say how they are used.
+
+    Args:
+        contents: the object, lights and cameras in it.
+        motions: names of its clips, joints and morph targets.
+    """
+    return {
+        "materials (--control 'texture={materials: [NAME]}')": (
+            contents.object.mesh.materials
+        ),
+        "lights": contents.lights,
+        "cameras (--camera NAME)": contents.cameras,
+        "clips (--control 'body={clip: NAME, time: [0, 1]}')": motions["clips"],
+        "joints (--control 'body={NAME.x: [-30, 30]}')": motions["joints"],
+        "morph targets (--control 'body={NAME.weight: [0, 1]}')": motions["targets"],
+    }
 
 
 def _format_names(names_by_kind: Mapping[str, Iterable[str]]) -> list[str]:
@@ -148,21 +180,21 @@ def _describe_object(mesh_object: Any) -> dict[str, Any]:
     }
 
 
-def _list_motions(rig: Any) -> tuple[list[str], list[str], list[str]]:
+def _list_motions(rig: Any) -> dict[str, list[str]]:
     """Return the names of the clips, joints and morph targets of a rig; empty lists
     without a rig.
 
     Each joint has parameters NAME.x, NAME.y and NAME.z, and each target NAME.weight.
     """
     if rig is None:
-        return [], [], []
+        return {"clips": [], "joints": [], "targets": []}
     joints = [name.removesuffix(".x") for name in rig.defaults if name.endswith(".x")]
     targets = [
         name.removesuffix(".weight")
         for name in rig.defaults
         if name.endswith(".weight")
     ]
-    return list(rig.clips), joints, targets
+    return {"clips": list(rig.clips), "joints": joints, "targets": targets}
 
 
 def _explain_slow_features(mesh_object: Any) -> list[str]:
@@ -191,10 +223,7 @@ def _format_nodes(file: str, nodes: Sequence[Any]) -> list[str]:
         file: path of the file, as the user wrote it.
         nodes: the nodes, at least one.
     """
-    rows = [["node", "in controls", "", "size"]]
-    for node in nodes:
-        size = " x ".join(f"{length:.3g}" for length in node.size)
-        rows.append([node.name, node.mesh_name, f"{node.triangles:,} triangles", size])
+    rows = [["node", "in controls", "", "size"], *map(_make_node_row, nodes)]
     lines = [
         output.align_columns(rows),
         "One of them as the object, the rest around it: --object "
@@ -205,6 +234,12 @@ def _format_nodes(file: str, nodes: Sequence[Any]) -> list[str]:
             f"Another one moves with it: --control pose,pose:{nodes[0].mesh_name}"
         )
     return lines
+
+
+def _make_node_row(node: Any) -> list[str]:
+    """Return the row of a node in the table of nodes."""
+    size = " x ".join(f"{length:.3g}" for length in node.size)
+    return [node.name, node.mesh_name, f"{node.triangles:,} triangles", size]
 
 
 def _describe_mitsuba_file(file: str, out: Path | None) -> Understood:
@@ -227,37 +262,12 @@ def _describe_mitsuba_file(file: str, out: Path | None) -> Understood:
     from advsearch.scene.mitsuba_backend.scene_files import read_contents
 
     contents = read_contents(Path(file))
-    warnings: tuple[str, ...] = ()
-    if contents.objects:
-        object_name = next(
-            (name for name in contents.objects if name not in contents.lights),
-            contents.objects[0],  # if all are lights
-        )
-        scene = advsearch.load_scene(object_name, scene=file)
-        warnings = scene.description.object.warnings
-        if out is not None:
-            # one view, as large as the four of a mesh file together
-            advsearch.render(scene, resolution=2 * SIDE).save(out)
-    elif out is not None:
-        raise InputError(
-            f"{file}: no shape of it can be the object, so that it cannot "
-            "be pictured; leave --out out"
-        )
+    warnings = _load_mitsuba_object(file, contents, out)
     # Shapes that advsearch renders but cannot change, with the reason.
     unchanged_shapes = dict(contents.unchanged)
-    names_by_kind = {
-        "objects": list(contents.objects),
-        # for the text; for JSON it is a mapping, see below
-        "kept": [f"{name} ({reason})" for name, reason in unchanged_shapes.items()],
-        "lights": list(contents.lights),
-        "cameras": list(contents.cameras),
-    }
+    names_by_kind = _name_kinds_of_mitsuba_file(contents, unchanged_shapes)
     lines = [f"{file}: a Mitsuba scene", *_format_names(names_by_kind)]
-    if contents.objects:
-        lines.append(
-            f"One of them as the object, the rest around it: --scene {file} "
-            f"--object {contents.objects[-1]}"
-        )
+    lines += _format_object_flags(file, contents.objects)
     lines += [f"Note: {warning}" for warning in warnings]
     facts = {
         **names_by_kind,
@@ -265,6 +275,72 @@ def _describe_mitsuba_file(file: str, out: Path | None) -> Understood:
         "warnings": list(warnings),
     }
     return facts, lines
+
+
+def _name_kinds_of_mitsuba_file(
+    contents: PluginContents, unchanged_shapes: Mapping[str, str]
+) -> dict[str, list[str]]:
+    """Return the names in a Mitsuba file by their kind.
+
+    Args:
+        contents: the shapes, lights and cameras in it.
+        unchanged_shapes: shapes that advsearch renders but cannot change, with the
+            reason, which is a part of the text here.
+    """
+    return {
+        "objects": list(contents.objects),
+        "kept": [f"{name} ({reason})" for name, reason in unchanged_shapes.items()],
+        "lights": list(contents.lights),
+        "cameras": list(contents.cameras),
+    }
+
+
+def _format_object_flags(file: str, object_names: Sequence[str]) -> list[str]:
+    """Return a line with flags that choose a shape; no line if there are no shapes."""
+    if not object_names:
+        return []
+    return [
+        f"One of them as the object, the rest around it: --scene {file} "
+        f"--object {object_names[-1]}"
+    ]
+
+
+def _load_mitsuba_object(
+    file: str, contents: PluginContents, out: Path | None
+) -> tuple[str, ...]:
+    """Load a shape of a Mitsuba file, render it if `out` is given; return the warnings.
+
+    Args:
+        file: path of the file, as the user wrote it.
+        contents: the shapes and lights in the file.
+        out: file of the picture; None renders none.
+
+    Raises:
+        InputError: an image is requested, but no shape can be the object.
+    """
+    if not contents.objects and out is not None:
+        raise InputError(
+            f"{file}: no shape of it can be the object, so that it cannot "
+            "be pictured; leave --out out"
+        )
+    if not contents.objects:
+        return ()
+    scene = advsearch.load_scene(_choose_object_shape(contents), scene=file)
+    warnings = scene.description.object.warnings
+    if out is not None:
+        # one view, as large as the four of a mesh file together
+        advsearch.render(scene, resolution=2 * SIDE).save(out)
+    return warnings
+
+
+def _choose_object_shape(contents: PluginContents) -> str:
+    """Return the first shape of a Mitsuba file that is no light; the first shape if all
+    are lights.
+    """
+    for name in contents.objects:
+        if name not in contents.lights:
+            return name
+    return contents.objects[0]
 
 
 def _describe(parser: argparse.ArgumentParser) -> None:

@@ -51,7 +51,7 @@ from advsearch.trust.code import allow_code, restrict_allowed_code
 from advsearch.version import __version__
 
 if TYPE_CHECKING:
-    from advsearch.experiment import Experiment
+    from advsearch.experiment import Experiment, PositionalArgument
     from advsearch.settings import Config
 
 # --------------------------------------------------------------------------------
@@ -130,18 +130,23 @@ class ExperimentCommand:
 
         add_settings(parser, self.experiment.settings)
         output.add_quiet_flags(parser)
-        subject_setting = self.experiment.about
-        positional = self.experiment.positional
-        if positional:
-            parser.add_argument(
-                subject_setting,
-                metavar=positional.metavar,
-                nargs="*" if positional.is_repeatable else "?",
-                default=argparse.SUPPRESS,
-                help=f"as `--{subject_setting}`{positional.help_suffix}",
-            )
-        if subject_setting:  # its run or file may name code
+        if self.experiment.positional:
+            self._add_subject(parser, self.experiment.positional)
+        if self.experiment.about:  # its run or file may name code
             output.add_code_flag(parser)
+
+    def _add_subject(
+        self, parser: argparse.ArgumentParser, positional: PositionalArgument
+    ) -> None:
+        """Add the subject of the experiment as an argument without a flag."""
+        subject_setting = self.experiment.about
+        parser.add_argument(
+            subject_setting,
+            metavar=positional.metavar,
+            nargs="*" if positional.is_repeatable else "?",
+            default=argparse.SUPPRESS,
+            help=f"as `--{subject_setting}`{positional.help_suffix}",
+        )
 
     def run(self, args: argparse.Namespace) -> int:
         """Run the experiment that the arguments describe, and return the exit status.
@@ -156,6 +161,20 @@ class ExperimentCommand:
         subject = getattr(args, subject_setting, None)
         if self.experiment.choices and subject == "list":
             return self._print_choices(as_json=args.json)
+        self._check_subject(subject)
+        # A repeatable subject is a list of words. As a setting it is one text with commas.
+        if isinstance(subject, list):
+            setattr(args, subject_setting, ",".join(subject))
+        return self.run_config(
+            self.read_config(args), as_json=args.json, quiet=args.quiet
+        )
+
+    def _check_subject(self, subject: object) -> None:
+        """Check that a subject is there if the experiment takes one without a flag.
+
+        Raises:
+            InputError: it is missing.
+        """
         is_missing = subject in (None, [])
         if self.experiment.positional and is_missing:
             command = f"advsearch {self.name}"
@@ -163,12 +182,6 @@ class ExperimentCommand:
                 f"{command}: expected {self.experiment.positional.expected}; see "
                 f"{command} --help"
             )
-        # A repeatable subject is a list of words. As a setting it is one text with commas.
-        if isinstance(subject, list):
-            setattr(args, subject_setting, ",".join(subject))
-        return self.run_config(
-            self.read_config(args), as_json=args.json, quiet=args.quiet
-        )
 
     def _print_choices(self, *, as_json: bool) -> int:
         """Print the names that can be the subject, and return the exit status."""
@@ -194,35 +207,51 @@ class ExperimentCommand:
         # late, so that --help answers at once
         from advsearch.cli.flags import make_config
         from advsearch.runs.directory import CONFIG, find_run
-        from advsearch.settings import settings, split_names
 
         config_type = self.experiment.settings
-        subject_setting = self.experiment.about
         read_defaults = self.experiment.defaults_from_run
         if read_defaults is None:
             return make_config(args, config_type)
-        if subject_setting in args:  # the earlier run was given
-            run_name = getattr(args, subject_setting)
-            positional = self.experiment.positional
-            if positional and positional.is_repeatable:
-                # the first of several runs; a text without any name is left as it is,
-                # and rejected by `find_run`
-                run_name = next(iter(split_names(run_name)), run_name)
-            defaults = read_defaults(find_run(run_name) / CONFIG, vars(args))
+        if self.experiment.about in args:  # the earlier run was given
+            run = find_run(self._get_first_run_name(args))
+            defaults = read_defaults(run / CONFIG, vars(args))
             return make_config(args, config_type, **defaults)
+        self._check_required_settings(args)
+        return make_config(args, config_type)
+
+    def _get_first_run_name(self, args: argparse.Namespace) -> str:
+        """Return the run that the experiment is about; of several, the first."""
+        # late, so that --help answers at once
+        from advsearch.settings import split_names
+
+        run_name: str = getattr(args, self.experiment.about)
+        positional = self.experiment.positional
+        if positional and positional.is_repeatable:
+            # a text without any name is left as it is, and rejected by `find_run`
+            return next(iter(split_names(run_name)), run_name)
+        return run_name
+
+    def _check_required_settings(self, args: argparse.Namespace) -> None:
+        """Check that all required settings are among the arguments, as no run has them.
+
+        Raises:
+            InputError: one is missing.
+        """
+        # late, so that --help answers at once
+        from advsearch.settings import settings
+
         missing = [
             setting.flag
-            for setting in settings(config_type)
+            for setting in settings(self.experiment.settings)
             if setting.required and setting.field not in args
         ]
         if missing:
             command = f"advsearch {self.name}"
-            run_flag = f"--{subject_setting.replace('_', '-')} RUN"
+            run_flag = f"--{self.experiment.about.replace('_', '-')} RUN"
             raise InputError(
                 f"{command}: expected {missing[0]} NAME, or {run_flag}; "
                 f"see {command} --help"
             )
-        return make_config(args, config_type)
 
     def run_config(
         self,
@@ -459,20 +488,30 @@ def _run_and_report_errors(words: list[str]) -> int:
         sys.stdout.flush()
         return status
     except AdvsearchError as error:
-        # late, so that --help answers at once
-        from advsearch.cli.flags import format_as_flags
-
-        # A message names settings as in a file ("steps") if they come from a file, else
-        # as flags ("--steps"). Some advice is always a flag, such as --code, since no
-        # file may allow its own code.
-        advises_flag = isinstance(error, (UnknownNameError, CodeNotAllowedError))
-        is_about_file = words[0] in ("run", "resume") and not advises_flag
-        text = str(error) if is_about_file else format_as_flags(str(error))
+        text = _format_error(error, words[0])
         print(f"advsearch: error: {shorten_words(text)}", file=sys.stderr)
         return BAD_INPUT
     except BrokenPipeError:
         # the output is closed, for instance by `head`
         return OK
+
+
+def _format_error(error: AdvsearchError, first_word: str) -> str:
+    """Return the message of an error, with settings named as the user wrote them.
+
+    Args:
+        error: the error.
+        first_word: first word of the command line.
+    """
+    # late, so that --help answers at once
+    from advsearch.cli.flags import format_as_flags
+
+    # A message names settings as in a file ("steps") if they come from a file, else as
+    # flags ("--steps"). Some advice is always a flag, such as --code, since no file may
+    # allow its own code.
+    advises_flag = isinstance(error, (UnknownNameError, CodeNotAllowedError))
+    is_about_file = first_word in ("run", "resume") and not advises_flag
+    return str(error) if is_about_file else format_as_flags(str(error))
 
 
 def _run(words: list[str]) -> int:
@@ -481,6 +520,22 @@ def _run(words: list[str]) -> int:
     Python code that the flag `--code` names is allowed to run from here on.
     """
     name = words[0] if words and not words[0].startswith("-") else None
+    _check_command_name(name)
+    try:
+        args = _parse(words, name)
+    except SystemExit as stop:  # --help and --version have printed their text
+        return int(stop.code or 0)
+    allow_code(*getattr(args, "code", ()))
+    return int(get_command(args.command).run(args))
+
+
+def _check_command_name(name: str | None) -> None:
+    """Check that there is a command of a name; None, for none, is right.
+
+    Raises:
+        InputError: the command was removed.
+        UnknownNameError: there is no such command.
+    """
     if name == "plan":
         raise InputError(
             "`plan` is a part of `check` now: use advsearch check --loss "
@@ -490,12 +545,6 @@ def _run(words: list[str]) -> int:
         raise UnknownNameError(
             "command", name, list_commands(), "See advsearch --help."
         )
-    try:
-        args = _parse(words, name)
-    except SystemExit as stop:  # --help and --version have printed their text
-        return int(stop.code or 0)
-    allow_code(*getattr(args, "code", ()))
-    return int(get_command(args.command).run(args))
 
 
 def _parse(words: list[str], command: str | None) -> argparse.Namespace:
@@ -568,17 +617,25 @@ def _list_commands_with_help() -> list[str]:
     groups = group_commands()
     longest_name = max(len(name) for group in groups.values() for name in group)
     text_begin = longest_name + 4  # two spaces on each side of the names
-    # in a narrow terminal too, texts get as much width as names
-    line_width = max(shutil.get_terminal_size().columns - 2, 2 * text_begin)
     lines = []
     for title, names in groups.items():
         lines.append(title)
-        for name in names:
-            text = f"  {name}".ljust(text_begin) + get_command_help(name)
-            indent = " " * text_begin
-            lines.append(textwrap.fill(text, line_width, subsequent_indent=indent))
+        lines += [_format_command_line(name, text_begin) for name in names]
         lines.append("")
     return lines
+
+
+def _format_command_line(name: str, text_begin: int) -> str:
+    """Return a command's name and its description, which is wrapped.
+
+    Args:
+        name: name of the command.
+        text_begin: column at which the description begins.
+    """
+    # in a narrow terminal too, texts get as much width as names
+    line_width = max(shutil.get_terminal_size().columns - 2, 2 * text_begin)
+    text = f"  {name}".ljust(text_begin) + get_command_help(name)
+    return textwrap.fill(text, line_width, subsequent_indent=" " * text_begin)
 
 
 def add_command(
@@ -599,21 +656,31 @@ def add_command(
         return cast(argparse.ArgumentParser, subparsers.add_parser(name))
     command = get_command(name)
     text = get_command_help(name)
-    examples = "".join(f"  advsearch {line}\n" for line in command.examples)
-    # the examples keep their line breaks
-    formatter: type[argparse.HelpFormatter] = argparse.HelpFormatter
-    if examples:
-        formatter = argparse.RawDescriptionHelpFormatter
     parser: argparse.ArgumentParser = subparsers.add_parser(
         name,
         help=text,
         description=f"{text[0].upper()}{text[1:]}{command.more}.",
-        epilog=f"examples:\n{examples}" if examples else None,
-        formatter_class=formatter,
         allow_abbrev=False,
+        **_make_examples_options(command.examples),
     )
     command.add_arguments(parser)
     return parser
+
+
+def _make_examples_options(examples: Sequence[str]) -> dict[str, Any]:
+    """Return the options of a parser with which its help ends with examples.
+
+    Args:
+        examples: command lines without `advsearch`; empty for a help without examples.
+    """
+    if not examples:
+        return {"epilog": None, "formatter_class": argparse.HelpFormatter}
+    lines = "".join(f"  advsearch {line}\n" for line in examples)
+    return {
+        "epilog": f"examples:\n{lines}",
+        # the examples keep their line breaks
+        "formatter_class": argparse.RawDescriptionHelpFormatter,
+    }
 
 
 def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputError:
@@ -627,45 +694,77 @@ def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputEr
         argument: the unknown argument, such as "--step=3".
         parser: parser of the command.
     """
-    # late, so that --help answers at once
-    from advsearch.calls import suggest_keyword
-    from advsearch.config import CONFIGS
-    from advsearch.settings import settings
-
     name = argument.partition("=")[0]
     # the flags of the command, as its help writes them
     known = re.findall(r"(?<!\S)--[a-z][a-z-]*", parser.format_help())
     if not name.startswith("--"):
-        hint = ""
-        if "--object" in known:
-            hint = f"; for the object write --object {argument}"
-        return InputError(
-            f"expected flags, got {argument!r}{hint}; see {parser.prog} --help"
-        )
-    commands_with_flag = [
-        command
-        for command, config in CONFIGS.items()
-        if name in (setting.flag for setting in settings(config))
-    ]
+        return _make_no_flag_error(argument, parser.prog, known)
+    commands_with_flag = _find_commands_with_flag(name)
     if commands_with_flag:
         return InputError(
             f"{parser.prog} has no {name}, a flag of advsearch "
             f"{', '.join(commands_with_flag)}; leave it out"
         )
-    # the flag for what other libraries call by this name, or why there is none
-    keyword = name.removeprefix("--").replace("-", "_")
-    suggestions, reason = suggest_keyword(
-        keyword, [flag.removeprefix("--") for flag in known]
-    )
-    text = f"{parser.prog} has no {name}"
-    if suggestions:
-        text += f"; did you mean {' or '.join(f'--{flag}' for flag in suggestions)}?"
-    if reason:
-        text += f" ({reason})"
-    if suggestions or reason:
-        return InputError(text)
+    advice = _suggest_flag(name, known)
+    if advice:
+        return InputError(f"{parser.prog} has no {name}{advice}")
     # a flag with a similar spelling is suggested
     return UnknownNameError("flag", name, set(known))
+
+
+def _make_no_flag_error(
+    argument: str, program: str, known: Sequence[str]
+) -> InputError:
+    """Return the error for a word without dashes where a flag is expected.
+
+    Args:
+        argument: the word.
+        program: the command, such as "advsearch attack".
+        known: its flags.
+    """
+    hint = ""
+    if "--object" in known:
+        hint = f"; for the object write --object {argument}"
+    return InputError(f"expected flags, got {argument!r}{hint}; see {program} --help")
+
+
+def _find_commands_with_flag(flag: str) -> list[str]:
+    """Return the names of the commands that have a flag, such as "--steps"."""
+    # late, so that --help answers at once
+    from advsearch.config import CONFIGS
+    from advsearch.settings import settings
+
+    return [
+        command
+        for command, config in CONFIGS.items()
+        if flag in (setting.flag for setting in settings(config))
+    ]
+
+
+def _suggest_flag(flag: str, known: Sequence[str]) -> str:
+    """Return the flag for what other libraries call by a name, or why there is none.
+
+    Args:
+        flag: the unknown flag.
+        known: the flags of the command.
+
+    Returns:
+        The end of a message; empty if the name is unknown elsewhere, too.
+    """
+    # late, so that --help answers at once
+    from advsearch.calls import suggest_keyword
+
+    keyword = flag.removeprefix("--").replace("-", "_")
+    suggestions, reason = suggest_keyword(
+        keyword, [known_flag.removeprefix("--") for known_flag in known]
+    )
+    text = ""
+    if suggestions:
+        flags = " or ".join(f"--{suggestion}" for suggestion in suggestions)
+        text += f"; did you mean {flags}?"
+    if reason:
+        text += f" ({reason})"
+    return text
 
 
 if __name__ == "__main__":

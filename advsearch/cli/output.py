@@ -34,7 +34,7 @@ from advsearch.interrupts import INTERRUPTS
 from advsearch.progress import Progress, escape_text, open_progress
 
 if TYPE_CHECKING:
-    from advsearch.report.views import ResultPart
+    from advsearch.report.views import ResultPart, ShownResult
     from advsearch.runs.results import Result
 
 
@@ -262,30 +262,35 @@ def make_resume_command(run: str | Path) -> str:
         run: the run directory.
     """
     # late, so that --help answers at once
-    from advsearch.cli.flags import read_command, read_file_config
-    from advsearch.config import SceneConfig
     from advsearch.runs.directory import CONFIG, format_run_name
-    from advsearch.settings import split_names
 
     words = ["advsearch", "resume", format_run_name(run)]
-    file = Path(run) / CONFIG
     # If the file cannot be read, the printed command reports it when it is run.
     with suppress(AdvsearchError):
-        config = read_file_config(read_command(file), file, {})
-        if not isinstance(config, SceneConfig):
-            return shlex.join(words)
-        metrics = getattr(config, "metrics", {}).values()
-        all_names = "".join([config.model, *config.control_kinds, *metrics])
-        # Code is named as "module:name". Listing it exactly takes seconds, so that is
-        # done only if there is a colon in any name.
-        if ":" in all_names:
-            from advsearch.engine.naming import list_imported_code  # takes seconds
-
-            names = list_imported_code(
-                split_names(config.model), config.control_kinds, metrics
-            )
-            words += [word for name in names for word in ("--code", name)]
+        for name in _list_code_in_file(Path(run) / CONFIG):
+            words += ["--code", name]
     return shlex.join(words)
+
+
+def _list_code_in_file(file: Path) -> Sequence[str]:
+    """Return the Python code that a file of settings names, as "module:name"."""
+    # late, so that --help answers at once
+    from advsearch.cli.flags import read_command, read_file_config
+    from advsearch.config import SceneConfig
+    from advsearch.settings import split_names
+
+    config = read_file_config(read_command(file), file, {})
+    if not isinstance(config, SceneConfig):
+        return ()
+    metrics = getattr(config, "metrics", {}).values()
+    all_names = "".join([config.model, *config.control_kinds, *metrics])
+    # Listing the code exactly takes seconds, so that is done only if there is a colon
+    # in any name.
+    if ":" not in all_names:
+        return ()
+    from advsearch.engine.naming import list_imported_code  # takes seconds
+
+    return list_imported_code(split_names(config.model), config.control_kinds, metrics)
 
 
 @contextmanager
@@ -306,12 +311,17 @@ def redirect_output() -> Iterator[None]:
             yield
     finally:
         if stdout_descriptor is not None:
-            # The C library buffers what native code prints: write that out before
-            # descriptor 1 is standard output again.
-            with suppress(OSError, AttributeError):
-                ctypes.CDLL(None).fflush(None)
-            os.dup2(stdout_descriptor, 1)
-            os.close(stdout_descriptor)
+            _restore_stdout(stdout_descriptor)
+
+
+def _restore_stdout(stdout_descriptor: int) -> None:
+    """Make descriptor 1 standard output again, of which there is a copy to close."""
+    # The C library buffers what native code prints: write that out before descriptor 1
+    # is standard output again.
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).fflush(None)
+    os.dup2(stdout_descriptor, 1)
+    os.close(stdout_descriptor)
 
 
 def format_result(result: Result) -> str:
@@ -321,21 +331,29 @@ def format_result(result: Result) -> str:
     """
     # late, so that --help answers at once
     from advsearch.cli.flags import format_as_flags
-    from advsearch.report.views import collect_facts, get_view, list_remarks
-    from advsearch.runs.directory import REPORT
+    from advsearch.report.views import get_view, list_remarks
 
     view = get_view(result)
     paragraphs = [view.statement]
     for part in view.sections:
         if part.is_visible_in("text"):
             paragraphs.append(_format_part(part))
+    paragraphs.append(_format_facts(result, view))
+    notes = [f"Note: {format_as_flags(text)}" for text in list_remarks(result, view)]
+    return _join_nonempty("\n\n", [*paragraphs, *notes])
+
+
+def _format_facts(result: Result, view: ShownResult) -> str:
+    """Return the facts of a result, and the path of its page, as a table."""
+    # late, so that --help answers at once
+    from advsearch.report.views import collect_facts
+    from advsearch.runs.directory import REPORT
+
     facts = [[name.lower(), text] for name, text in collect_facts(result, view).items()]
     run = getattr(result, "run", None)
     if run:
         facts.append(["page", f"{run}/{REPORT}"])
-    paragraphs.append(align_columns(facts))
-    notes = [f"Note: {format_as_flags(text)}" for text in list_remarks(result, view)]
-    return _join_nonempty("\n\n", [*paragraphs, *notes])
+    return align_columns(facts)
 
 
 def _format_part(part: ResultPart) -> str:

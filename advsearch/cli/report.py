@@ -9,12 +9,14 @@ import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
 from advsearch.cli.main import argument, command
 from advsearch.extend import InputError
 
+if TYPE_CHECKING:
+    from advsearch.questions.report.result import Evidence
 NAME = "evidence"
 # The file with the camera poses of photographs, and its maximum size in bytes.
 POSES = "poses.csv"
@@ -87,33 +89,70 @@ def report(args: argparse.Namespace) -> int:
     Raises:
         InputError: an argument is wrong, or the folder cannot be made.
     """
-    # late, so that --help answers at once
-    from advsearch.extend import directory, writing
-    from advsearch.questions.report.evidence import collect_evidence, read_exposure
-    from advsearch.questions.report.result import format_markdown, make_evidence_page
-
     folder = Path(args.out)
     output_paths = [folder / f"{NAME}.{suffix}" for suffix in ("html", "md", "json")]
     _check_arguments(args, output_paths)
+    # the claims of all runs; and images by the name of their file
+    evidence, images = _collect_evidence(args)
+    _make_folder(folder)
+    _write_evidence(evidence, images, output_paths)
+    text = _format_evidence(evidence, output_paths)
+    return output.print_answer(args.json, evidence.to_dict(), text)
+
+
+def _collect_evidence(args: argparse.Namespace) -> tuple[Evidence, dict[str, bytes]]:
+    """Return the claims of the runs, and images by the name of their file.
+
+    Photographs that the arguments name are added to the first run before.
+
+    Args:
+        args: arguments of the command.
+    """
+    # late, so that --help answers at once
+    from advsearch.questions.report.evidence import collect_evidence, read_exposure
+
     exposure = {} if args.exposure is None else read_exposure(args.exposure)
     if args.photographs is not None:
         _add_photographs(args.photographs, args.runs[0])
-    # the claims of all runs; and images by the name of their file
-    evidence, images = collect_evidence(
+    return collect_evidence(
         args.runs,
         criterion=args.criterion,
         exposure=exposure,
         by=args.by,
         twins=args.twins,
     )
+
+
+def _make_folder(folder: Path) -> None:
+    """Make the folder for the files, if it does not exist yet.
+
+    Raises:
+        InputError: it cannot be made.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(
             f"--out: cannot make the folder {folder}: {error.strerror}"
         ) from None
+
+
+def _write_evidence(
+    evidence: Evidence, images: Mapping[str, bytes], output_paths: Sequence[Path]
+) -> None:
+    """Write the images, and the claims as a page, as Markdown and as JSON.
+
+    Args:
+        evidence: the claims of all runs.
+        images: images by the name of their file.
+        output_paths: the files for the page, Markdown and JSON, in one folder.
+    """
+    # late, so that --help answers at once
+    from advsearch.extend import directory, writing
+    from advsearch.questions.report.result import format_markdown, make_evidence_page
+
     for name, data in images.items():
-        writing.write_bytes(folder / name, data)
+        writing.write_bytes(output_paths[0].parent / name, data)
     contents = (
         make_evidence_page(evidence, images),
         format_markdown(evidence),
@@ -121,8 +160,6 @@ def report(args: argparse.Namespace) -> int:
     )
     for path, content in zip(output_paths, contents, strict=True):
         writing.write_text(path, content)
-    text = _format_evidence(evidence, output_paths)
-    return output.print_answer(args.json, evidence.to_dict(), text)
 
 
 def _format_evidence(evidence: Any, output_paths: Sequence[Path]) -> str:
@@ -151,16 +188,25 @@ def _check_arguments(args: argparse.Namespace, output_paths: Sequence[Path]) -> 
             "the page of one run is "
             "report.html in its folder"
         )
-    existing_files = [path for path in output_paths if path.exists()]
-    if existing_files and not args.overwrite:
-        raise InputError(
-            f"{existing_files[0]}: exists already; add --overwrite or choose "
-            "another folder with --out"
-        )
+    _check_no_output(output_paths, overwrite=args.overwrite)
     if args.criterion is not None and not 0.0 < args.criterion <= 1.0:
         raise InputError(
             "--criterion: expected a share over 0 and at most 1, such as "
             f"0.9, got {args.criterion:g}"
+        )
+
+
+def _check_no_output(output_paths: Sequence[Path], *, overwrite: bool) -> None:
+    """Check that no file exists already, unless files may be replaced.
+
+    Raises:
+        InputError: one exists.
+    """
+    existing_files = [path for path in output_paths if path.exists()]
+    if existing_files and not overwrite:
+        raise InputError(
+            f"{existing_files[0]}: exists already; add --overwrite or choose "
+            "another folder with --out"
         )
 
 
@@ -184,9 +230,8 @@ def _add_photographs(folder: str, name: str) -> None:
     with tempfile.TemporaryDirectory() as temporary_folder:
         photograph_folder = Path(folder)
         if (photograph_folder / POSES).is_file():
-            photograph_folder = _copy_named_by_pose(
-                photograph_folder, run, Path(temporary_folder)
-            )
+            copies = Path(temporary_folder)
+            photograph_folder = _copy_named_by_pose(photograph_folder, run, copies)
         photographs = workbench.load_photographs()
         files = photographs.list_files(photograph_folder, task)
         _check_photographs(files, folder)
@@ -236,30 +281,52 @@ def _copy_named_by_pose(folder: Path, run: Path, out: Path) -> Path:
             renderings.
     """
     # late, so that --help answers at once
-    from advsearch.extend import Store, stored_files
+    from advsearch.extend import stored_files
 
-    with Store.open_to_read(run) as store:
-        # the number of each rendering, and its values by parameter
-        renderings = [
-            (row.step, {name: value["value"] for name, value in row.values.items()})
-            for row in store.rows("sweep")
-        ]
+    renderings = _read_renderings(run)
     table = stored_files.read_text(folder / POSES, "poses", MAX_POSES_BYTES)
     # line 1 has the heads, so that poses begin on line 2
     for line, pose in enumerate(csv.DictReader(table.splitlines()), 2):
         location = f"photographs: {folder / POSES}, line {line}"
-        # Only the name of the file is used, without its folders: a table cannot name a
-        # file outside of the folder.
-        file = folder / Path(str(pose.pop("file", ""))).name
-        if not file.is_file():
-            raise InputError(
-                f"{location}: expected the name of a photograph in the same folder "
-                f"under `file`, got {file.name!r}"
-            )
+        file = _find_posed_photograph(folder, pose.pop("file", ""), location)
         steps = [step for step, values in renderings if _has_pose(values, pose)]
         _check_single_rendering(steps, location, run, pose)
         shutil.copyfile(file, out / f"rendering-{steps[0]}-{file.name}")
     return out
+
+
+def _read_renderings(run: Path) -> list[tuple[int, dict[str, Any]]]:
+    """Return the number of each rendering of a sweep, and its values by parameter."""
+    # late, so that --help answers at once
+    from advsearch.extend import Store
+
+    with Store.open_to_read(run) as store:
+        return [
+            (row.step, {name: value["value"] for name, value in row.values.items()})
+            for row in store.rows("sweep")
+        ]
+
+
+def _find_posed_photograph(folder: Path, name: object, location: str) -> Path:
+    """Return the photograph that a line of the table of poses names.
+
+    Args:
+        folder: folder of the table and the photographs.
+        name: the entry in the column "file".
+        location: file and line of the pose, for the message.
+
+    Raises:
+        InputError: there is no such file.
+    """
+    # Only the name of the file is used, without its folders: a table cannot name a file
+    # outside of the folder.
+    file = folder / Path(str(name)).name
+    if not file.is_file():
+        raise InputError(
+            f"{location}: expected the name of a photograph in the same folder "
+            f"under `file`, got {file.name!r}"
+        )
+    return file
 
 
 def _check_single_rendering(

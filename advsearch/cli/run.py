@@ -17,8 +17,8 @@ from advsearch.cli.show import show_run
 from advsearch.errors import InputError
 from advsearch.registry import get_experiment
 from advsearch.runs.directory import CONFIG, HOME, REPORT, find_run, read_python_only
-from advsearch.runs.listing import is_finished, list_runs
-from advsearch.settings import parse_assignment
+from advsearch.runs.listing import ListedRun, is_finished, list_runs
+from advsearch.settings import Config, parse_assignment
 from advsearch.settings.values import set_dotted
 from advsearch.trust.code import allow_code_in_settings
 from advsearch.viewer.pages import write_page
@@ -99,27 +99,40 @@ def run_file(
             as one that connects to other machines.
     """
     config = read_file_config(read_command(file), file, changes)
-    # `omitted_settings` are settings of the file that count only if a person types
-    # them, such as an address to connect to. `config` has their defaults instead. A new
-    # run would silently differ from the file, so it is an error. A run that is resumed
-    # was started with them; it goes on if they do not change its numbers.
+    is_resumed = resumed_directory is not None
+    _check_omitted_settings(file, config, is_resumed=is_resumed, quiet=args.quiet)
+    experiment_command = main.ExperimentCommand(get_experiment(config.command))
+    return experiment_command.run_config(
+        config, as_json=args.json, quiet=args.quiet, resumed_directory=resumed_directory
+    )
+
+
+def _check_omitted_settings(
+    file: str | Path, config: Config, *, is_resumed: bool, quiet: bool
+) -> None:
+    """Check that a run can do without the settings that only a person may type.
+
+    Those of a file are ignored, such as an address to connect to. `config` has their
+    defaults instead. A new run would silently differ from the file, so it is an error.
+    A run that is resumed was started with them; it goes on if they do not change its
+    numbers, and they are printed unless `quiet`.
+
+    Raises:
+        InputError: it cannot.
+    """
     for setting in config.omitted_settings:
         decides_numbers = setting.name not in config.changeable_settings
-        if resumed_directory is None or decides_numbers:
+        if not is_resumed or decides_numbers:
             raise InputError(
                 f"{file}: {setting.name}: {setting.effect}, which a file "
                 f"can't ask for; type {setting.advice}"
             )
-        if not args.quiet:
+        if not quiet:
             print(
                 f"advsearch: {setting.name} is left out: it {setting.effect}; type "
                 f"{setting.advice}",
                 file=sys.stderr,
             )
-    experiment_command = main.ExperimentCommand(get_experiment(config.command))
-    return experiment_command.run_config(
-        config, as_json=args.json, quiet=args.quiet, resumed_directory=resumed_directory
-    )
 
 
 @command(
@@ -154,22 +167,53 @@ def resume(args: argparse.Namespace) -> int:
     """
     path = find_run(args.run)
     changes = parse_changes(args.change)
+    _check_has_settings(path)
+    command = read_command(path / CONFIG)
+    if is_finished(path) and not _can_add_to_finished_run(command, changes):
+        return _show_finished_run(path, as_json=args.json)
+    _check_parts_are_stored(path)
+    return run_file(path / CONFIG, changes, args, resumed_directory=path)
+
+
+def _check_has_settings(path: Path) -> None:
+    """Check that the folder of a run has its settings.
+
+    Raises:
+        InputError: it has none.
+    """
     if not (path / CONFIG).is_file():
         raise InputError(
             f"{path}: expected a run with its {CONFIG}, got none; start it again"
         )
-    command = read_command(path / CONFIG)
-    # Two commands can add something to a finished run: a sweep gets a map of the
-    # surface, and a recipe makes its figures again, with photographs taken since.
+
+
+def _can_add_to_finished_run(command: str, changes: Mapping[str, object]) -> bool:
+    """Return whether resuming a finished run of a command adds something to it."""
+    # Two commands can: a sweep gets a map of the surface, and a recipe makes its
+    # figures again, with photographs taken since.
     adds_surface = changes.get("surface") is True and command == "sweep"
-    adds_to_finished_run = command == "recipe" or adds_surface
-    if is_finished(path) and not adds_to_finished_run:
-        print(f"advsearch: {path} is done already", file=sys.stderr)
-        # The page may be missing: the disk was full as it was written, or somebody
-        # removed it.
-        if not (path / REPORT).is_file():
-            write_page(path)
-        return show_run(str(path), args.json)
+    return command == "recipe" or adds_surface
+
+
+def _show_finished_run(path: Path, *, as_json: bool) -> int:
+    """Print the result of a finished run, and return the exit status.
+
+    The page is written if it is missing.
+    """
+    print(f"advsearch: {path} is done already", file=sys.stderr)
+    # The page may be missing: the disk was full as it was written, or somebody removed
+    # it.
+    if not (path / REPORT).is_file():
+        write_page(path)
+    return show_run(str(path), as_json)
+
+
+def _check_parts_are_stored(path: Path) -> None:
+    """Check that no part of a run existed only in the Python session that began it.
+
+    Raises:
+        InputError: there is such a part.
+    """
     missing = [part.text for part in read_python_only(path)]
     if missing:
         raise InputError(
@@ -177,7 +221,6 @@ def resume(args: argparse.Namespace) -> int:
             "Python session of the run; call the same function with the same arguments "
             "again, an attack with `resume=True`"
         )
-    return run_file(path / CONFIG, changes, args, resumed_directory=path)
 
 
 MAX_CONTROL_NAMES = 4  # maximum number of controls of a run that the table names
@@ -203,30 +246,31 @@ def runs(args: argparse.Namespace) -> int:
             f"{folder}: expected a folder with runs in it, got no such folder"
         )
     listed_runs = list_runs(folder)
-    rows = [["run", "command", "object", "controls", "rows", "state", "result"]]
-    for run in listed_runs:
-        names = ",".join(run.controls)
-        n_omitted = len(run.controls) - MAX_CONTROL_NAMES
-        if n_omitted > 1:  # a single name is as short as "1 more"
-            names = f"{','.join(run.controls[:MAX_CONTROL_NAMES])} and {n_omitted} more"
-        rows.append(
-            [
-                run.name,
-                run.command,
-                run.object,
-                names,
-                str(run.rows),
-                run.state,
-                run.outcome,
-            ]
-        )
     text = f"no runs in {folder}/ yet; advsearch attack makes one"
     if listed_runs:
-        text = output.align_columns(rows)
-    output.print_answer(
-        args.json, {"command": "runs", "runs": [vars(run) for run in listed_runs]}, text
-    )
+        heads = ["run", "command", "object", "controls", "rows", "state", "result"]
+        text = output.align_columns([heads, *map(_make_run_row, listed_runs)])
+    facts = {"command": "runs", "runs": [vars(run) for run in listed_runs]}
+    output.print_answer(args.json, facts, text)
     for run in listed_runs:
         if run.fault and not args.json:
             print(f"advsearch: {run.name}: {run.fault}", file=sys.stderr)
     return 0
+
+
+def _make_run_row(run: ListedRun) -> list[str]:
+    """Return the row of a run in the table of runs."""
+    control_names = ",".join(run.controls)
+    n_omitted = len(run.controls) - MAX_CONTROL_NAMES
+    if n_omitted > 1:  # a single name is as short as "1 more"
+        first_names = ",".join(run.controls[:MAX_CONTROL_NAMES])
+        control_names = f"{first_names} and {n_omitted} more"
+    return [
+        run.name,
+        run.command,
+        run.object,
+        control_names,
+        str(run.rows),
+        run.state,
+        run.outcome,
+    ]

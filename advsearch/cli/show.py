@@ -31,7 +31,7 @@ from advsearch.registry import (
 from advsearch.report.wording import format_count, format_interval
 from advsearch.runs.directory import IMAGES, PHOTOGRAPHS, find_run
 from advsearch.runs.listing import ListedRun, read_listed_run
-from advsearch.runs.results import to_json_value
+from advsearch.runs.results import Result, to_json_value
 from advsearch.runs.summary import NAME, read_result
 from advsearch.trust.code import allow_code_in_settings
 
@@ -72,31 +72,60 @@ def show(args: argparse.Namespace) -> int:
     Raises:
         InputError: the words name none of these.
     """
-    if args.picture and (args.json or len(args.what) > 1):
-        raise InputError(
-            "--picture: draws the pictures of one run, after its text; "
-            "give one run, and leave --json out"
-        )
+    _check_picture_flag(args)
     match args.what:
         case ["control" | "policy" | "task" as kind, name]:
             return _show_declared(kind, name, args.json)
         # An experiment with a list of named choices, such as "recipe NAME".
         case [command, name] if _find_choice_description(command) is not None:
-            describe_choice = load_attribute(_find_choice_description(command))
-            text, facts = describe_choice(name)
-            return output.print_answer(args.json, {command: name, **facts}, text)
+            return _show_choice(command, name, args.json)
         case [name]:
-            try:
-                return show_run(name, args.json, picture=args.picture)
-            except UnknownNameError as error:
-                raise InputError(
-                    f"{error} For anything but a run, put its kind before the name, as "
-                    "in: advsearch show control pose"
-                ) from None
+            return _show_named_run(name, args)
     kinds = "control NAME, policy NAME, task NAME, recipe NAME"
     raise InputError(
         f"expected the name of a run, or one of {kinds}, got {' '.join(args.what)!r}"
     )
+
+
+def _check_picture_flag(args: argparse.Namespace) -> None:
+    """Check that `--picture` is given for the text of one run only.
+
+    Raises:
+        InputError: it is given with `--json`, or for something else.
+    """
+    if args.picture and (args.json or len(args.what) > 1):
+        raise InputError(
+            "--picture: draws the pictures of one run, after its text; "
+            "give one run, and leave --json out"
+        )
+
+
+def _show_choice(command: str, name: str, as_json: bool) -> int:
+    """Print the description of a choice of an experiment, such as a recipe.
+
+    Args:
+        command: command of the experiment.
+        name: name of the choice.
+        as_json: print it as JSON.
+    """
+    describe_choice = load_attribute(_find_choice_description(command))
+    text, facts = describe_choice(name)
+    return output.print_answer(as_json, {command: name, **facts}, text)
+
+
+def _show_named_run(name: str, args: argparse.Namespace) -> int:
+    """Print a run as the flags say.
+
+    Raises:
+        InputError: there is no such run.
+    """
+    try:
+        return show_run(name, args.json, picture=args.picture)
+    except UnknownNameError as error:
+        raise InputError(
+            f"{error} For anything but a run, put its kind before the name, as "
+            "in: advsearch show control pose"
+        ) from None
 
 
 def _find_choice_description(command: str) -> Any:
@@ -127,17 +156,23 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
         return _show_unfinished(read_listed_run(path), as_json)
     result = read_result(path)
     photos = find_photographs(path)
-    if not as_json:
+    if as_json:
+        _print_result_as_json(result, photos)
+    else:
         print(output.format_result(result) + output.explain_resume(result))
         if photos and photos.interval is not None:
             _print_agreement(photos)
-    elif photos:
-        output.print_json({**result.to_dict(), "photos": photos.to_dict()})
-    else:
-        output.print_json(result)
     if picture:
         show_pictures(find_best_images(path))
     return 0
+
+
+def _print_result_as_json(result: Result, photos: Any) -> None:
+    """Print a result as JSON, with its photographs' agreement if it has any."""
+    if photos:
+        output.print_json({**result.to_dict(), "photos": photos.to_dict()})
+    else:
+        output.print_json(result)
 
 
 def find_photographs(run: Path) -> Any:
@@ -187,6 +222,17 @@ def _show_unfinished(run: ListedRun, as_json: bool) -> int:
     resume_command = None
     if run.started and is_stopped:
         resume_command = output.make_resume_command(run.path)
+    lines = _describe_progress(run)
+    if resume_command is not None:
+        lines += ["", f"Go on with: {resume_command}"]
+    elif is_stopped:
+        lines += ["", "It has no run.yaml, so it can't be resumed; start again."]
+    facts = {**vars(run), "run": run.path, "ending": None, "resume": resume_command}
+    return output.print_answer(as_json, facts, "\n".join(lines))
+
+
+def _describe_progress(run: ListedRun) -> list[str]:
+    """Return lines with the subject of an unfinished run and its evaluations so far."""
     subject = run.command
     if run.object:
         searched = " and ".join(run.controls) or "nothing searched"
@@ -195,19 +241,10 @@ def _show_unfinished(run: ListedRun, as_json: bool) -> int:
     if run.state == "running":
         state_text = "A process is working on it"
     row_counts = ", ".join(f"{number} of {kind}" for kind, number in run.kinds.items())
-    lines = [
+    return [
         f"{run.name}: {subject}.",
         f"{state_text}; evaluations kept so far: {row_counts or 'none'}.",
     ]
-    if resume_command is not None:
-        lines += ["", f"Go on with: {resume_command}"]
-    elif is_stopped:
-        lines += ["", "It has no run.yaml, so it can't be resumed; start again."]
-    return output.print_answer(
-        as_json,
-        {**vars(run), "run": run.path, "ending": None, "resume": resume_command},
-        "\n".join(lines),
-    )
 
 
 PLURALS = {"control": "controls", "policy": "policies", "task": "tasks"}
@@ -224,6 +261,21 @@ def _show_declared(kind: str, name: str, as_json: bool) -> int:
     Returns:
         The exit status.
     """
+    entry = _find_declared(kind, name)
+    if kind == "control":
+        facts, paragraphs = _describe_control(name, entry)
+    else:
+        facts, paragraphs = _describe_options(kind, name, entry)
+    text = "\n\n".join([f"{name}: {get_first_doc_line(entry)}", *paragraphs])
+    return output.print_answer(as_json, {kind: name, **facts}, text)
+
+
+def _find_declared(kind: str, name: str) -> Any:
+    """Return the class of a control, policy or task.
+
+    Raises:
+        UnknownNameError: there is none of this name.
+    """
     with open_answer_progress():
         registry = _registry(PLURALS[kind])  # takes seconds
     # A control may be named as "module:name". This code may run, since a person typed it.
@@ -231,13 +283,7 @@ def _show_declared(kind: str, name: str, as_json: bool) -> int:
         allow_code_in_settings({"controls": name})
     if name not in registry:
         raise UnknownNameError(kind, name, registry)
-    entry = registry[name]
-    if kind == "control":
-        facts, paragraphs = _describe_control(name, entry)
-    else:
-        facts, paragraphs = _describe_options(kind, name, entry)
-    text = "\n\n".join([f"{name}: {get_first_doc_line(entry)}", *paragraphs])
-    return output.print_answer(as_json, {kind: name, **facts}, text)
+    return registry[name]
 
 
 def _describe_control(name: str, control: Any) -> tuple[dict[str, Any], list[str]]:
@@ -254,22 +300,22 @@ def _describe_control(name: str, control: Any) -> tuple[dict[str, Any], list[str
         "parameters": to_json_value(control.parameters),
         "choices": to_json_value(control.choices),
     }
-    paragraphs = list[str]()
-    if control.parameters:
-        paragraphs.append(
-            "parameters, searched or fixed:\n"
-            + _format_table(list(map(_make_parameter_row, control.parameters)))
-        )
-    else:
-        paragraphs.append(
-            f"The scene names its parameters: --control {name}:KEY=[low, high]"
-        )
+    paragraphs = [_describe_parameters(name, control.parameters)]
     if control.choices:
-        paragraphs.append(
-            "settings, chosen:\n"
-            + _format_table(list(map(_make_choice_row, control.choices)))
-        )
+        choice_table = _format_table(list(map(_make_choice_row, control.choices)))
+        paragraphs.append(f"settings, chosen:\n{choice_table}")
     return facts, paragraphs
+
+
+def _describe_parameters(name: str, parameters: Sequence[Parameter]) -> str:
+    """Return a table of the parameters of a kind of control, as a paragraph.
+
+    A kind without parameters has those that the scene names.
+    """
+    if not parameters:
+        return f"The scene names its parameters: --control {name}:KEY=[low, high]"
+    table = _format_table(list(map(_make_parameter_row, parameters)))
+    return f"parameters, searched or fixed:\n{table}"
 
 
 def _describe_options(
@@ -282,14 +328,7 @@ def _describe_options(
         name: its name.
         entry: its class.
     """
-    options = list[dict[str, Any]]()
-    for option, field in list_declared_options(entry).items():
-        default = get_option_default(field)
-        # an object, such as another task, is represented by its name
-        default = to_json_value(getattr(default, "name", default))
-        options.append(
-            {"name": option, "type": get_option_type(field), "default": default}
-        )
+    options = _list_options_of_class(entry)
     if not options:
         return {"options": options}, ["It has no options."]
     rows = [
@@ -299,19 +338,25 @@ def _describe_options(
     return {"options": options}, [f"{heading}\n{_format_table(rows)}"]
 
 
+def _list_options_of_class(entry: Any) -> list[dict[str, Any]]:
+    """Return name, type and default of each option of a policy's or task's class."""
+    options = list[dict[str, Any]]()
+    for option, field in list_declared_options(entry).items():
+        default = get_option_default(field)
+        # an object, such as another task, is represented by its name
+        default = to_json_value(getattr(default, "name", default))
+        options.append(
+            {"name": option, "type": get_option_type(field), "default": default}
+        )
+    return options
+
+
 def _make_parameter_row(parameter: Parameter) -> dict[str, str]:
     """Return the row of a parameter in the table of its control, by column."""
-    unit = parameter.unit
-    if parameter.shape:  # such as "(any x 3)"; a single number has no shape
-        sides = ["any" if side is None else str(side) for side in parameter.shape]
-        unit += f" ({' x '.join(sides)})"
-    allowed = ", ".join(parameter.options)
-    if not allowed:  # a range of numbers
-        allowed = f"{parameter.low:g} to {parameter.high:g}"
     return {
         "name": parameter.name,
-        "unit": unit,
-        "allowed": allowed,
+        "unit": _format_unit(parameter),
+        "allowed": _format_allowed(parameter),
         "searched": _format_searched(parameter),
         "default": _format_cell(parameter.default),
         "periodic": _format_cell(parameter.periodic),
@@ -319,6 +364,21 @@ def _make_parameter_row(parameter: Parameter) -> dict[str, str]:
         "derivative": "none" if parameter.options else ", ".join(parameter.estimators),
         "description": parameter.description,
     }
+
+
+def _format_unit(parameter: Parameter) -> str:
+    """Return the unit of a parameter, and its shape if it is no single number."""
+    if not parameter.shape:
+        return parameter.unit
+    # such as "(any x 3)"
+    sides = ["any" if side is None else str(side) for side in parameter.shape]
+    return f"{parameter.unit} ({' x '.join(sides)})"
+
+
+def _format_allowed(parameter: Parameter) -> str:
+    """Return the values that a parameter may have: its options, or else its range."""
+    options = ", ".join(parameter.options)
+    return options or f"{parameter.low:g} to {parameter.high:g}"
 
 
 def _format_searched(parameter: Parameter) -> str:
@@ -333,22 +393,25 @@ def _format_searched(parameter: Parameter) -> str:
 
 def _make_choice_row(choice: Choice) -> dict[str, str]:
     """Return the row of a table for a setting of a control, with its allowed values."""
-    if choice.integer_bounds:
-        lower, upper = choice.integer_bounds
-        allowed = f"{lower} to {upper}"
-    elif choice.max_value and choice.signed:
-        allowed = f"{-choice.max_value:g} to {choice.max_value:g}"
-    elif choice.max_value:
-        allowed = f"over 0 to {choice.max_value:g}"
-    else:  # a name, or anything if there are no options
-        allowed = ", ".join(choice.options)
-    default = _format_cell(choice.default)
     return {
         "name": choice.name,
-        "allowed": allowed,
-        "default": default,
+        "allowed": _format_allowed_choices(choice),
+        "default": _format_cell(choice.default),
         "description": choice.description,
     }
+
+
+def _format_allowed_choices(choice: Choice) -> str:
+    """Return the values that a setting of a control may have."""
+    if choice.integer_bounds:
+        lower, upper = choice.integer_bounds
+        return f"{lower} to {upper}"
+    if choice.max_value and choice.signed:
+        return f"{-choice.max_value:g} to {choice.max_value:g}"
+    if choice.max_value:
+        return f"over 0 to {choice.max_value:g}"
+    # a name, or anything if there are no options
+    return ", ".join(choice.options)
 
 
 def _format_table(rows: Sequence[Mapping[str, str]]) -> str:
@@ -394,18 +457,23 @@ def show_pictures(files: Sequence[Path]) -> None:
     print()
     for file in files:
         if draw is not None:
-            try:
-                draw(file)
-            # whatever a terminal answers, the paths of the pictures are printed
-            except Exception as error:
+            failure = _try_to_draw(draw, file)
+            if failure:
                 draw = None
-                refusal = (
-                    f"The pictures could not be drawn here: {type(error).__name__}: "
-                    f"{error}"
-                )
+                refusal = failure
         print(f"  picture   {file}")
     if refusal:
         print(f"\n{refusal}")
+
+
+def _try_to_draw(draw: Callable[[Path], None], file: Path) -> str:
+    """Draw a picture in the terminal; return why it failed, or "" if it did not."""
+    try:
+        draw(file)
+    # whatever a terminal answers, the paths of the pictures are printed
+    except Exception as error:
+        return f"The pictures could not be drawn here: {type(error).__name__}: {error}"
+    return ""
 
 
 def _find_drawing_function() -> tuple[Callable[[Path], None] | None, str]:
@@ -502,16 +570,27 @@ def list_all(args: argparse.Namespace) -> int:
         kinds = [kind for kind in REGISTRIES if kind != CASES]
     with open_answer_progress():
         names = {kind: list_names(kind) for kind in kinds}
+    text = _format_names_of_kinds(names, with_headings=args.kind == "all")
+    facts = {kind: list(entries) for kind, entries in names.items()}
+    return output.print_answer(args.json, facts, text)
+
+
+def _format_names_of_kinds(
+    names: Mapping[str, Mapping[str, str]], *, with_headings: bool
+) -> str:
+    """Return a table of names for each kind as text.
+
+    Args:
+        names: names of each kind, with a description of each.
+        with_headings: whether each table has its kind as a heading.
+    """
     tables = {
         kind: output.align_columns([*entries.items()])
         for kind, entries in names.items()
     }
-    if args.kind == "all":
-        text = "\n\n".join(f"{kind}:\n{table}" for kind, table in tables.items())
-    else:
-        text = tables[args.kind]
-    facts = {kind: list(entries) for kind, entries in names.items()}
-    return output.print_answer(args.json, facts, text)
+    if with_headings:
+        return "\n\n".join(f"{kind}:\n{table}" for kind, table in tables.items())
+    return "\n\n".join(tables.values())
 
 
 @command(
@@ -547,12 +626,9 @@ def labels(args: argparse.Namespace) -> int:
             "leave the word out to see all"
         )
     entries = [{"index": index, "label": name} for index, name in classes.items()]
-    text = output.align_columns(
-        [[f"#{index}", name] for index, name in classes.items()]
-    )
-    return output.print_answer(
-        args.json, {"command": "labels", "word": args.word, "labels": entries}, text
-    )
+    rows = [[f"#{index}", name] for index, name in classes.items()]
+    facts = {"command": "labels", "word": args.word, "labels": entries}
+    return output.print_answer(args.json, facts, output.align_columns(rows))
 
 
 def _load_labels(args: argparse.Namespace) -> Sequence[str]:

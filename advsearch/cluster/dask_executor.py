@@ -196,11 +196,26 @@ class DaskExecutor(WorkerExecutor):
         deadline = time.monotonic() + seconds
         dask.config.set(CONFIG)
         logging.getLogger("distributed").setLevel(SILENT)
-        # Until the deadline, `_connect` may fail early, as while a scheduler starts.
+        self._client = self._connect_until(security, deadline)
+        # compared in `count_workers`, to notice that the client has connected again
+        self._connection = self._client.scheduler_comm
+        self._set_link()
+
+    def _connect_until(self, security: Any, deadline: float) -> Any:
+        """Return a client of the scheduler, which is tried until a deadline.
+
+        `_connect` may fail early, as while a scheduler starts.
+
+        Args:
+            security: Dask's `Security` with the certificates; None for no encryption.
+            deadline: time (`time.monotonic`) until which the scheduler may answer.
+
+        Raises:
+            ClusterError: no scheduler answers.
+        """
         while True:
             try:
-                self._client = self._connect(security, deadline)
-                break
+                return self._connect(security, deadline)
             # Dask raises these if nothing answers at the address, or if something other
             # than a scheduler answers.
             except (
@@ -211,15 +226,20 @@ class DaskExecutor(WorkerExecutor):
                 ValueError,
             ) as error:
                 if time.monotonic() >= deadline:
-                    raise ClusterError(
-                        f"{self.description}: there is no scheduler that answers "
-                        f"({error or type(error).__name__}); start one with dask "
-                        "scheduler, check address and certificates, and go on with "
-                        "advsearch resume"
-                    ) from error
+                    raise self._make_connection_error(error) from error
                 time.sleep(LOOK_SECONDS)
-        # compared in `count_workers`, to notice that the client has connected again
-        self._connection = self._client.scheduler_comm
+
+    def _make_connection_error(self, error: Exception) -> ClusterError:
+        """Return the error for a scheduler that does not answer."""
+        return ClusterError(
+            f"{self.description}: there is no scheduler that answers "
+            f"({error or type(error).__name__}); start one with dask "
+            "scheduler, check address and certificates, and go on with "
+            "advsearch resume"
+        )
+
+    def _set_link(self) -> None:
+        """Store and report the address of Dask's page about the workers."""
         # Dask draws its pages with bokeh; without it the link leads to an error.
         has_pages = importlib.util.find_spec("bokeh") is not None
         self.link = str(self._client.dashboard_link or "") if has_pages else ""
@@ -238,11 +258,8 @@ class DaskExecutor(WorkerExecutor):
 
         untyped: Any = distributed
         # started once, however often the connection is tried
-        if self._site.start is not None and self._cluster is None:
-            keywords = {} if security is None else {"security": security}
-            self._cluster = self._site.start(**keywords)
-            if self._site.count is not None:
-                self._cluster.scale(self._site.count)
+        if self._cluster is None:
+            self._start_cluster(security)
         seconds_left = min(CONNECT_SECONDS, deadline - time.monotonic())
         return untyped.Client(
             self._cluster or self._site.address,
@@ -250,6 +267,19 @@ class DaskExecutor(WorkerExecutor):
             timeout=max(1.0, seconds_left),
             set_as_default=False,
         )
+
+    def _start_cluster(self, security: Any) -> None:
+        """Start the cluster of the site, if it has one, with its number of workers.
+
+        Args:
+            security: Dask's `Security` with the certificates; None for no encryption.
+        """
+        if self._site.start is None:
+            return
+        keywords = {} if security is None else {"security": security}
+        self._cluster = self._site.start(**keywords)
+        if self._site.count is not None:
+            self._cluster.scale(self._site.count)
 
     # ---- who is there
 
@@ -264,19 +294,7 @@ class DaskExecutor(WorkerExecutor):
         """
         now = time.monotonic()
         if now - self._looked_at >= LOOK_SECONDS:
-            client = self._client
-            # A client may connect again by itself. Then it is running, but with another
-            # connection, and the calls that were running are lost.
-            is_connected = (
-                client.status == "running" and client.scheduler_comm is self._connection
-            )
-            if not is_connected:
-                self._reconnect()
-            # A scheduler that does not answer is slow or about to end. The next look
-            # will show which, so the old count is used until then.
-            with suppress(OSError, TimeoutError, asyncio.TimeoutError):
-                self._update_workers()
-            self._looked_at = time.monotonic()
+            self._look_for_workers()
         # The time without fit workers begins now if there is one now, or if this method
         # was not called for so long that workers may have come and gone.
         was_long_ago = now - self._counted_at > LESS_PATIENCE
@@ -286,6 +304,22 @@ class DaskExecutor(WorkerExecutor):
         self._counted_at = time.monotonic()
         return len(self._usable_addresses)
 
+    def _look_for_workers(self) -> None:
+        """Connect again if the connection was lost, and look up the workers."""
+        client = self._client
+        # A client may connect again by itself. Then it is running, but with another
+        # connection, and the calls that were running are lost.
+        is_connected = (
+            client.status == "running" and client.scheduler_comm is self._connection
+        )
+        if not is_connected:
+            self._reconnect()
+        # A scheduler that does not answer is slow or about to end. The next look will
+        # show which, so the old count is used until then.
+        with suppress(OSError, TimeoutError, asyncio.TimeoutError):
+            self._update_workers()
+        self._looked_at = time.monotonic()
+
     def _update_workers(self) -> None:
         """Ask the scheduler which workers are connected, and sort them.
 
@@ -294,10 +328,7 @@ class DaskExecutor(WorkerExecutor):
         reason is stored.
         """
         client = self._client
-        # the keys: `ncores` returns the number of cores of each worker by its address
-        connected = frozenset(
-            client.sync(client.scheduler.ncores, callback_timeout=RESPONSE_SECONDS)
-        )
+        connected = _read_connected_addresses(client)
         self.stats.lost += len(self._usable_addresses - connected)
         self._refusal_by_address = {
             address: reason
@@ -306,18 +337,29 @@ class DaskExecutor(WorkerExecutor):
         }
         fit = self._usable_addresses & connected
         new = connected - fit - set(self._refusal_by_address)
-        versions = {}
-        if new:
-            versions = client.sync(
-                self._versions, sorted(new), callback_timeout=RESPONSE_SECONDS
-            )
+        fit |= self._sort_new_workers(client, new)
+        # A call that ran during these queries may have refused a worker that was fit.
+        self._usable_addresses = fit - set(self._refusal_by_address)
+
+    def _sort_new_workers(self, client: Any, new: frozenset[str]) -> frozenset[str]:
+        """Return the new workers that have our version of advsearch; refuse the others.
+
+        Args:
+            client: client of the connection that was used.
+            new: addresses of workers.
+        """
+        if not new:
+            return frozenset()
+        versions = client.sync(
+            self._versions, sorted(new), callback_timeout=RESPONSE_SECONDS
+        )
+        fit = frozenset[str]()
         for address, version in versions.items():
             if version == compute_version():
                 fit |= {address}
             else:
                 self._refuse_version(address, version)
-        # A call that ran during these queries may have refused a worker that was fit.
-        self._usable_addresses = fit - set(self._refusal_by_address)
+        return fit
 
     def _refuse_version(self, address: str, version: Any) -> None:
         """Refuse a worker that has another version of advsearch, or none.
@@ -431,22 +473,11 @@ class DaskExecutor(WorkerExecutor):
         failed_starts = 0
         while client.status == "running":
             workers = sorted(self._usable_addresses)
-            future = client.submit(
-                call_on_worker,
-                function,
-                *args,
-                workers=workers,
-                allow_other_workers=False,
-                pure=False,
-                retries=0,
-            )
+            future = _submit_call(client, function, args, workers)
             try:
-                result = await self._wait(future, workers)
-                if result is not None:  # None if its worker has disconnected
-                    address, value = result
-                    is_rejected = await self._rejects_reply(client, address, value)
-                    if not is_rejected:
-                        return value
+                result = await self._wait_for_accepted(client, future, workers)
+                if result is not None:
+                    return result[1]
             except asyncio.CancelledError:
                 # Dask cancels the future of a lost worker: then the call is repeated.
                 # If asyncio cancels this call, its result is not needed any more.
@@ -457,12 +488,7 @@ class DaskExecutor(WorkerExecutor):
                     f"no answer: {MAX_DEATHS} workers died of it"
                 ) from None
             except Exception as error:
-                # `run_batch` catches errors and returns them in its reply. So this
-                # error means that the worker could not begin, for instance that it
-                # could not import the function. Other errors mean that the worker or
-                # the result was lost: then the call is repeated.
-                is_worker_lost = type(error).__name__ in NO_WORKER
-                if future.status == "error" and not is_worker_lost:
+                if _shows_failed_start(error, future):
                     failed_starts += 1
                     if failed_starts == MAX_TRIES:
                         raise self._make_start_error(error) from error
@@ -474,6 +500,26 @@ class DaskExecutor(WorkerExecutor):
             self.stats.retried += 1
             await asyncio.sleep(LOOK_SECONDS)
         raise BrokenExecutor(f"{self.description}: the scheduler has gone")
+
+    async def _wait_for_accepted(
+        self, client: Any, future: Any, workers: list[str]
+    ) -> tuple[str, Any] | None:
+        """Return the address of a call's worker and its value, if the reply is accepted.
+
+        Args:
+            client: client of the connection that was used.
+            future: Dask's future of the call.
+            workers: addresses of the workers that may run it.
+
+        Returns:
+            None if all workers have disconnected, or if the worker was unfit.
+        """
+        result = await self._wait(future, workers)
+        if result is None:
+            return None
+        address, value = result
+        is_rejected = await self._rejects_reply(client, address, value)
+        return None if is_rejected else result
 
     def _make_start_error(self, error: Exception) -> ClusterError:
         """Return the error for a call that workers cannot begin."""
@@ -557,17 +603,73 @@ class DaskExecutor(WorkerExecutor):
             call.cancel()
         client = self._client
         cluster = self._cluster
+        self._remove_sent_files(client)
+        self._client = self._cluster = None
+        for connection in (client, cluster):
+            if connection is not None:
+                with suppress(Exception):  # the other end may have gone
+                    connection.close(timeout=RESPONSE_SECONDS)
+
+    def _remove_sent_files(self, client: Any) -> None:
+        """Let the scheduler forget the files, if they were sent and it is connected.
+
+        Args:
+            client: client of the connection; None without one.
+        """
         is_connected = client is not None and client.status == "running"
         if is_connected and self._sending is not None:  # files were sent
             with suppress(Exception):
                 client.sync(
                     self._forget_files, client, callback_timeout=RESPONSE_SECONDS
                 )
-        self._client = self._cluster = None
-        for connection in (client, cluster):
-            if connection is not None:
-                with suppress(Exception):  # the other end may have gone
-                    connection.close(timeout=RESPONSE_SECONDS)
+
+
+def _read_connected_addresses(client: Any) -> frozenset[str]:
+    """Return the addresses of the workers that the scheduler is connected to.
+
+    Args:
+        client: client of the connection to the scheduler.
+    """
+    # the keys: `ncores` returns the number of cores of each worker by its address
+    return frozenset(
+        client.sync(client.scheduler.ncores, callback_timeout=RESPONSE_SECONDS)
+    )
+
+
+def _submit_call(
+    client: Any,
+    function: Callable[..., Any],
+    args: tuple[Any, ...],
+    workers: list[str],
+) -> Any:
+    """Return Dask's future of a call that one of some workers shall run, once.
+
+    Args:
+        client: client of the connection that is open now.
+        function: function to call.
+        args: its positional arguments.
+        workers: addresses of the workers.
+    """
+    return client.submit(
+        call_on_worker,
+        function,
+        *args,
+        workers=workers,
+        allow_other_workers=False,
+        pure=False,
+        retries=0,
+    )
+
+
+def _shows_failed_start(error: Exception, future: Any) -> bool:
+    """Return whether an error of a call means that its worker could not begin it.
+
+    For instance, it could not import the function: `run_batch` catches errors of the
+    call itself and returns them in its reply. Other errors mean that the worker or the
+    result was lost: then the call is repeated.
+    """
+    is_worker_lost = type(error).__name__ in NO_WORKER
+    return future.status == "error" and not is_worker_lost
 
 
 ADDRESS_SCHEMES = ("tcp://", "tls://", "ws://", "wss://")
@@ -636,12 +738,25 @@ def parse_site(workers: int | None, cluster: str) -> ClusterSite:
             "cluster: expected the address of a scheduler such as tcp://10.0.0.1:8786, "
             f"local, or a .yaml file, got {cluster!r}"
         )
+    _check_no_worker_number(site, workers)
+    return site
+
+
+def _check_no_worker_number(site: ClusterSite, workers: int | None) -> None:
+    """Check that no number of workers is set for a scheduler, which has workers.
+
+    Args:
+        site: the scheduler or the cluster.
+        workers: number of workers to start; None if it is not set.
+
+    Raises:
+        InputError: it is.
+    """
     if site.address and workers is not None:
         raise InputError(
             "workers: the scheduler of `cluster` says how many there are; "
             "leave one of the two out"
         )
-    return site
 
 
 def _read_site(path: Path, workers: int | None) -> ClusterSite:
@@ -660,17 +775,26 @@ def _read_site(path: Path, workers: int | None) -> ClusterSite:
     _check_entries(path, entries)
     security = _read_security(path, entries)
     count = entries.get("workers") if workers is None else workers
-    is_count = isinstance(count, int) and not isinstance(count, bool) and count >= 1
-    if count is not None and not is_count:
-        raise FileFormatError(
-            f"{path}: workers: expected a whole number of at least 1, got {count!r}"
-        )
+    _check_worker_count(path, count)
     if "address" in entries:
         return _read_scheduler(path, entries, security)
     name = str(entries["class"])
     start = partial(_import_cluster(path, name), **(entries.get("arguments") or {}))
     n_workers = 1 if count is None else count
     return ClusterSite(name, start=start, security=security, count=n_workers)
+
+
+def _check_worker_count(path: Path, count: object) -> None:
+    """Check the number of workers of a cluster file; None, for the default, is right.
+
+    Raises:
+        FileFormatError: it is no whole number of at least 1.
+    """
+    is_count = isinstance(count, int) and not isinstance(count, bool) and count >= 1
+    if count is not None and not is_count:
+        raise FileFormatError(
+            f"{path}: workers: expected a whole number of at least 1, got {count!r}"
+        )
 
 
 def _read_security(path: Path, entries: dict[str, Any]) -> dict[str, object] | None:
@@ -730,6 +854,22 @@ def _check_entries(path: Path, entries: dict[str, Any]) -> None:
     Raises:
         FileFormatError: an entry is unknown, missing or of another type.
     """
+    _check_entry_names(path, entries)
+    for name in ("security", "arguments"):
+        mapping = entries.get(name) or {}
+        is_mapping = isinstance(mapping, dict)
+        if not is_mapping or not all(isinstance(key, str) for key in mapping):
+            raise FileFormatError(
+                f"{path}: {name}: expected names and values, got {mapping!r}"
+            )
+
+
+def _check_entry_names(path: Path, entries: dict[str, Any]) -> None:
+    """Check that a cluster file has known entries, and "address" or "class".
+
+    Raises:
+        FileFormatError: an entry is unknown, or both or neither of the two are there.
+    """
     known = {"address", "class", "arguments", "workers", "security"}
     unknown = sorted(set(entries) - known)
     has_both_or_neither = ("address" in entries) == ("class" in entries)
@@ -742,13 +882,6 @@ def _check_entries(path: Path, entries: dict[str, Any]) -> None:
             "may have security"
         )
         raise FileFormatError(f"{path}: {expected}; {got}")
-    for name in ("security", "arguments"):
-        mapping = entries.get(name) or {}
-        is_mapping = isinstance(mapping, dict)
-        if not is_mapping or not all(isinstance(key, str) for key in mapping):
-            raise FileFormatError(
-                f"{path}: {name}: expected names and values, got {mapping!r}"
-            )
 
 
 def _import_cluster(path: Path, name: str) -> Any:

@@ -110,14 +110,7 @@ class LocalExecutor(WorkerExecutor):
             InputError: this process is a worker itself. It comes here if it imports a
                 script of the user that starts a run when it is imported.
         """
-        # the variable is set in the environment of each worker
-        is_worker = SERVE_VARIABLE in os.environ
-        if is_worker:
-            raise InputError(
-                "workers: a module that a worker imports asks for workers itself; put "
-                "what it asks under "
-                '`if __name__ == "__main__":`'
-            )
+        _check_is_no_worker()
         self.description = f"{count} workers on this machine"
         self.stats = WorkerStats()
         self._count = count
@@ -197,3 +190,19 @@ class LocalExecutor(WorkerExecutor):
         self._threads.shutdown(wait, cancel_futures=True)
         for process in self._idle:
             process.close()
+
+
+def _check_is_no_worker() -> None:
+    """Check that this process is no worker, which must not start workers itself.
+
+    Raises:
+        InputError: it is one.
+    """
+    # the variable is set in the environment of each worker
+    is_worker = SERVE_VARIABLE in os.environ
+    if is_worker:
+        raise InputError(
+            "workers: a module that a worker imports asks for workers itself; put "
+            "what it asks under "
+            '`if __name__ == "__main__":`'
+        )

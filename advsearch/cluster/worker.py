@@ -29,7 +29,7 @@ from functools import cache
 from importlib import metadata
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any
+from typing import IO, Any, TypeAlias
 
 from advsearch import threads  # before torch: it sets how OpenMP waits
 from advsearch.cluster import BatchFunction, WorkerTask
@@ -143,6 +143,16 @@ def read_files(task: WorkerTask) -> dict[str, bytes]:
             path = Path(part)
             if path.is_absolute() and path.is_file():
                 contents |= _read_with_neighbors(name, path)
+    _check_sent_size(contents)
+    return contents
+
+
+def _check_sent_size(contents: Mapping[str, bytes]) -> None:
+    """Check that files, with their contents by path, are small enough to be sent.
+
+    Raises:
+        InputError: together they are too large.
+    """
     size = sum(map(len, contents.values()))
     if size > MAX_SENT_BYTES:
         raise InputError(
@@ -150,7 +160,6 @@ def read_files(task: WorkerTask) -> dict[str, bytes]:
             f"{MAX_SENT_BYTES >> 20} can be sent; put them in a folder that all "
             "workers see, each under the same path"
         )
-    return contents
 
 
 def _read_with_neighbors(setting: str, path: Path) -> dict[str, bytes]:
@@ -232,6 +241,16 @@ def resolve_files(task: WorkerTask, folder: Path) -> WorkerTask:
     for path, digest in task.digests.items():
         if not _has_digest(local_paths[path], digest):
             raise MissingFilesError(path)
+    return _replace_paths(task, local_paths)
+
+
+def _replace_paths(task: WorkerTask, local_paths: Mapping[str, Path]) -> WorkerTask:
+    """Return a task whose settings have the paths of files on this machine.
+
+    Args:
+        task: the task.
+        local_paths: the local path of each file by its original path.
+    """
     settings = dict(task.settings)
     for name in task.path_setting_names:
         value = settings.get(name)
@@ -374,11 +393,7 @@ def load_task(task: WorkerTask) -> BatchFunction:
         _loaded.move_to_end(key)
         return _loaded[key]
     folder = make_private_directory()
-    # All workers of a user share one cache of compiled kernels, unless the user chose
-    # its directory.
-    if "DRJIT_CACHE_DIR" not in os.environ:
-        (folder / KERNELS).mkdir(exist_ok=True)
-        os.environ["DRJIT_CACHE_DIR"] = str(folder / KERNELS)
+    _set_kernel_cache(folder)
     # Called for its error only: without libLLVM it raises before anything is loaded.
     describe_machine()
     # The user allowed this code to run in the main process.
@@ -392,6 +407,19 @@ def load_task(task: WorkerTask) -> BatchFunction:
         _loaded.popitem(last=False)
     _loaded[key] = make_function(task.settings)
     return _loaded[key]
+
+
+def _set_kernel_cache(folder: Path) -> None:
+    """Set the directory of Dr.Jit's compiled kernels, unless the user chose it.
+
+    All workers of a user share one.
+
+    Args:
+        folder: directory of the workers of this user.
+    """
+    if "DRJIT_CACHE_DIR" not in os.environ:
+        (folder / KERNELS).mkdir(exist_ok=True)
+        os.environ["DRJIT_CACHE_DIR"] = str(folder / KERNELS)
 
 
 def _make_task_key(task: WorkerTask) -> str:
@@ -426,6 +454,8 @@ def make_private_directory() -> Path:
 
 # Environment variable that is set in a process that runs `serve`.
 SERVE_VARIABLE = "ADVSEARCH_WORKER"
+# Calls that were received: a function and its arguments.
+CallQueue: TypeAlias = "SimpleQueue[tuple[Callable[..., Any], tuple[Any, ...]]]"
 
 
 def serve() -> None:
@@ -441,18 +471,25 @@ def serve() -> None:
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
     os.dup2(2, 1)
-    received: SimpleQueue[tuple[Callable[..., Any], tuple[Any, ...]]] = SimpleQueue()
-
-    def listen() -> None:
-        """Receive calls, and end the process when the parent has ended."""
-        try:
-            while True:
-                received.put(pickle.load(calls))
-        except (EOFError, OSError):  # the parent process has gone
-            os._exit(0)  # also in the middle of a batch: its result has no reader
-
-    threading.Thread(target=listen, name="calls", daemon=True).start()
+    received: CallQueue = SimpleQueue()
+    threading.Thread(
+        target=_receive_calls, args=(calls, received), name="calls", daemon=True
+    ).start()
     while True:
         function, args = received.get()
         pickle.dump(function(*args), answers)
         answers.flush()
+
+
+def _receive_calls(calls: IO[bytes], received: CallQueue) -> None:
+    """Receive calls, and end the process when the parent has ended.
+
+    Args:
+        calls: stream of pickled calls.
+        received: queue to which they are added.
+    """
+    try:
+        while True:
+            received.put(pickle.load(calls))
+    except (EOFError, OSError):  # the parent process has gone
+        os._exit(0)  # also in the middle of a batch: its result has no reader

@@ -96,37 +96,78 @@ class PoolWorkers:
         try:
             while True:
                 INTERRUPTS.raise_pending()
-                n_workers = self._executor.count_workers()
-                now = self._clock()
-                self.stats.workers = n_workers
-                self.stats.alive += n_workers * (now - counted_at)
-                counted_at = now
-                # each worker that is free gets a batch
-                while len(running) < n_workers and queued.has_next():
-                    items = queued.take()
-                    deadline = self._deadline(len(items), item_seconds)
-                    future = self._executor.submit(
-                        run_batch, self._task, items, deadline
-                    )
-                    running[future] = items
-                    future.add_done_callback(ended.put)  # puts the future itself
-                self.stats.max_running = max(self.stats.max_running, len(running))
+                counted_at = self._count_workers(counted_at)
+                self._submit_batches(queued, running, ended, item_seconds)
                 if not running and not queued.has_next():
                     return
                 ended_future = self._wait(ended)
-                if ended_future is None:  # none ended within POLL_SECONDS
-                    continue
-                items = running.pop(ended_future)
-                error = _get_error(ended_future)
-                if error is not None:
-                    yield from self._handle_loss(items, error, queued)
-                    continue
-                reply = ended_future.result()
-                item_seconds.append(reply.seconds / max(1, len(items)))
-                yield self._read_reply(items, reply)
+                if ended_future is not None:
+                    items = running.pop(ended_future)
+                    yield from self._read_end(items, ended_future, queued, item_seconds)
         finally:
             for future in running:
                 future.cancel()
+
+    def _count_workers(self, counted_at: float) -> float:
+        """Count the workers and the seconds for which they were connected.
+
+        Args:
+            counted_at: time of the last count.
+
+        Returns:
+            The time of this count.
+        """
+        n_workers = self._executor.count_workers()
+        now = self._clock()
+        self.stats.workers = n_workers
+        self.stats.alive += n_workers * (now - counted_at)
+        return now
+
+    def _submit_batches(
+        self,
+        queued: _BatchQueue,
+        running: dict[Future[Reply], Sequence[Any]],
+        ended: queue.SimpleQueue[Future[Reply]],
+        item_seconds: Sequence[float],
+    ) -> None:
+        """Give a batch to each worker that is free.
+
+        Args:
+            queued: queue of batches that wait for a worker.
+            running: the items of each running batch, to which batches are added.
+            ended: gets the futures of these batches when they end.
+            item_seconds: seconds per item of the last batches.
+        """
+        while len(running) < self.stats.workers and queued.has_next():
+            items = queued.take()
+            deadline = self._deadline(len(items), item_seconds)
+            future = self._executor.submit(run_batch, self._task, items, deadline)
+            running[future] = items
+            future.add_done_callback(ended.put)  # puts the future itself
+        self.stats.max_running = max(self.stats.max_running, len(running))
+
+    def _read_end(
+        self,
+        items: Sequence[Any],
+        ended_future: Future[Reply],
+        queued: _BatchQueue,
+        item_seconds: deque[float],
+    ) -> Iterator[BatchResult]:
+        """Yield the result of a batch that has ended, or put it back into the queue.
+
+        Args:
+            items: items of the batch.
+            ended_future: its future.
+            queued: queue of batches that wait for a worker.
+            item_seconds: seconds per item of the last batches; this one is added.
+        """
+        error = _get_error(ended_future)
+        if error is not None:
+            yield from self._handle_loss(items, error, queued)
+            return
+        reply = ended_future.result()
+        item_seconds.append(reply.seconds / max(1, len(items)))
+        yield self._read_reply(items, reply)
 
     def _handle_loss(
         self, items: Sequence[Any], error: BaseException, queued: _BatchQueue
@@ -201,18 +242,22 @@ class PoolWorkers:
             raise RuntimeError(f"on {reply.worker}:\n{reply.error}")
         if reply.failure is not None:
             raise ClusterError(reply.error)
-        self.stats.batches += 1
-        self.stats.busy += reply.seconds
-        self.stats.loading += reply.loading_seconds
-        # `compute` adds all seconds for which workers are connected to `alive`. The
-        # seconds of loading are subtracted again.
-        self.stats.alive -= reply.loading_seconds
+        self._count_times(reply)
         machine: str | None = digest_machine(reply.machine)
         if machine == self._this_machine:  # rows of this machine name no machine
             machine = None
         elif machine is not None:
             self._note_machine(machine, reply)
         return BatchResult(items, reply.value, reply.worker, machine)
+
+    def _count_times(self, reply: Reply) -> None:
+        """Add a batch and its times to the statistics of the workers."""
+        self.stats.batches += 1
+        self.stats.busy += reply.seconds
+        self.stats.loading += reply.loading_seconds
+        # `compute` adds all seconds for which workers are connected to `alive`. The
+        # seconds of loading are subtracted again.
+        self.stats.alive -= reply.loading_seconds
 
     def _note_machine(self, machine: str, reply: Reply) -> None:
         """Store and report a machine that differs from this one, at its first reply.
@@ -313,13 +358,26 @@ def open_workers(
     if workers is None and cluster is None:
         yield None
         return
-    executor: WorkerExecutor
-    if cluster in (None, LOCAL):
-        executor = LocalExecutor(workers or threads.count_cores())
-    else:
-        open_dask = load_attribute("advsearch.cluster.dask_executor:open_dask")
-        executor, task = open_dask(task, workers, cluster, report_message)
+    executor, task = _open_executor(task, workers, cluster, report_message)
     try:
         yield PoolWorkers(executor, task, report_message)
     finally:
         executor.shutdown(cancel_futures=True)
+
+
+def _open_executor(
+    task: WorkerTask,
+    workers: int | None,
+    cluster: str | None,
+    report_message: Callable[[str], None],
+) -> tuple[WorkerExecutor, WorkerTask]:
+    """Return an executor on this machine or a cluster, and the task that it runs.
+
+    The arguments are those of `open_workers`.
+    """
+    if cluster in (None, LOCAL):
+        return LocalExecutor(workers or threads.count_cores()), task
+    open_dask: Callable[..., tuple[WorkerExecutor, WorkerTask]] = load_attribute(
+        "advsearch.cluster.dask_executor:open_dask"
+    )
+    return open_dask(task, workers, cluster, report_message)

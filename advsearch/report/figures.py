@@ -76,24 +76,26 @@ def render_figure(
     # late: matplotlib takes long to import
     import matplotlib.figure
 
-    files = {}
     with matplotlib.rc_context({**STYLE, **(style or {})}), warnings.catch_warnings():
         # matplotlib warns of letters that its font lacks. An SVG contains the text
         # itself, and a browser draws it with another font.
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
         figure = matplotlib.figure.Figure(figsize=size, layout="constrained")
         draw(figure)
-        for kind in kinds:
-            stream = io.BytesIO()
-            figure.savefig(
-                stream,
-                format=kind,
-                dpi=150,
-                # without a date, the same figure always gives the same file
-                metadata={"Date": None} if kind == "svg" else None,
-            )
-            files[kind] = stream.getvalue()
-    return files
+        return {kind: _encode_figure(figure, kind) for kind in kinds}
+
+
+def _encode_figure(figure: Figure, kind: str) -> bytes:
+    """Return a figure as the content of a file; `kind` is its suffix, png or svg."""
+    stream = io.BytesIO()
+    figure.savefig(
+        stream,
+        format=kind,
+        dpi=150,
+        # without a date, the same figure always gives the same file
+        metadata={"Date": None} if kind == "svg" else None,
+    )
+    return stream.getvalue()
 
 
 SERIES = (BLUE, RED, "#1f7a45", "#b4540a", "#6b3fa0", GREY)
@@ -123,21 +125,53 @@ def draw_fractions(
         colour = colours[index % len(colours)]
         mark = MARKS[index % len(MARKS)]
         offset = (index - (len(series) - 1) / 2) * spacing
-        for row, row_fractions in enumerate(rows.values()):
-            y = row + offset
-            fraction_and_interval = row_fractions[index]
-            if fraction_and_interval is None:
-                continue
-            fraction, interval = fraction_and_interval
-            axes.plot(interval, [y] * 2, color=colour, alpha=0.45, linewidth=3)
-            axes.plot(fraction, y, mark, color=colour, ms=5, label=label)
-            # Only the first dot of a series has its label, so that the legend has it
-            # once; matplotlib leaves out labels that begin with "_".
-            label = "_"
-    axes.set_yticks(range(len(rows)), list(rows))
+        fractions = [
+            (row + offset, row_fractions[index])
+            for row, row_fractions in enumerate(rows.values())
+        ]
+        _draw_series(axes, fractions, label, colour, mark)
+    _set_row_axes(axes, list(rows))
+
+
+def _set_row_axes(axes: Any, labels: Sequence[str]) -> None:
+    """Set axes for fractions in [0, 1] on rows that are 1 apart, from the top.
+
+    Args:
+        axes: axes of matplotlib.
+        labels: label of each row.
+    """
+    axes.set_yticks(range(len(labels)), labels)
     # upside down: the first row is at the top
-    axes.set(xlim=(-0.03, 1.03), ylim=(len(rows) - 0.4, -0.6))
+    axes.set(xlim=(-0.03, 1.03), ylim=(len(labels) - 0.4, -0.6))
     axes.grid(True, axis="x")
+
+
+def _draw_series(
+    axes: Any,
+    fractions: Sequence[tuple[float, tuple[float, Sequence[float]] | None]],
+    label: str,
+    colour: str,
+    mark: str,
+) -> None:
+    """Draw the fractions of one series, with their intervals.
+
+    Args:
+        axes: axes of matplotlib, on which it is drawn.
+        fractions: the height y of each row, and its fraction with the two bounds of its
+            interval, or None to draw nothing.
+        label: name of the series, for the legend.
+        colour: its color.
+        mark: its marker.
+    """
+    for y, fraction_and_interval in fractions:
+        if fraction_and_interval is None:
+            continue
+        fraction, interval = fraction_and_interval
+        axes.plot(interval, [y] * 2, color=colour, alpha=0.45, linewidth=3)
+        axes.plot(fraction, y, mark, color=colour, ms=5, label=label)
+        # Only the first dot of a series has its label, so that the legend has it once;
+        # matplotlib leaves out labels that begin with "_".
+        label = "_"
 
 
 def draw_searches(
@@ -165,25 +199,27 @@ def draw_searches(
     ):
         _draw_search(axes, name, values, colour, dashes)
     if zero_means:
-        axes.axhline(0.0, color=GREY, linewidth=1, linestyle=(0.0, (5.0, 4.0)))
-        # at the right end of the zero line, 4 points above it
-        axes.annotate(
-            zero_means,
-            xy=(1.0, 0.0),
-            xytext=(-4, 4),
-            xycoords=axes.get_yaxis_transform(),
-            textcoords="offset points",
-            ha="right",
-        )
-    axes.set(
-        xlabel="evaluations",
-        ylabel=meaning,
-        # up to 2 at least: an axis for a single evaluation would have no width
-        xlim=(1, max(2, *map(len, objectives.values()))),
-    )
+        _draw_zero_line(axes, zero_means)
+    # up to 2 at least: an axis for a single evaluation would have no width
+    last_evaluation = max(2, *map(len, objectives.values()))
+    axes.set(xlabel="evaluations", ylabel=meaning, xlim=(1, last_evaluation))
     axes.locator_params("x", integer=True)
     axes.grid(True, axis="y")
     axes.legend()
+
+
+def _draw_zero_line(axes: Any, text: str) -> None:
+    """Draw a dashed horizontal line at zero, with a text at its right end."""
+    axes.axhline(0.0, color=GREY, linewidth=1, linestyle=(0.0, (5.0, 4.0)))
+    # 4 points above the line
+    axes.annotate(
+        text,
+        xy=(1.0, 0.0),
+        xytext=(-4, 4),
+        xycoords=axes.get_yaxis_transform(),
+        textcoords="offset points",
+        ha="right",
+    )
 
 
 def _draw_search(
@@ -204,16 +240,7 @@ def _draw_search(
         best_so_far = np.fmax.accumulate(objective)  # `fmax` ignores NaN
     # of a long search only some points are drawn
     indices = _select_points(len(objective))
-    # Each dot is drawn as a line of length 0 with round ends. So all dots are a single
-    # path in the SVG, which keeps the page small.
-    axes.plot(
-        _as_dots(indices + 1.0),
-        _as_dots(objective[indices]),
-        solid_capstyle="round",
-        linewidth=4,
-        alpha=0.35,
-        color=colour,
-    )
+    _draw_evaluation_dots(axes, indices + 1.0, objective[indices], colour)
     axes.plot(
         indices + 1,
         best_so_far[indices],
@@ -244,6 +271,30 @@ ACCURACY = "accuracy"
 MAX_POINTS = 400  # maximum number of points that are drawn of a search
 
 
+def _draw_evaluation_dots(
+    axes: Any, numbers: Any, objectives: Any, colour: str
+) -> None:
+    """Draw a faint dot for each evaluation of a search.
+
+    Each dot is drawn as a line of length 0 with round ends. So all dots are a single
+    path in the SVG, which keeps the page small.
+
+    Args:
+        axes: axes of matplotlib, on which it is drawn.
+        numbers: (n,) number of each evaluation, from 1.
+        objectives: (n,) objective of each evaluation; NaN is not drawn.
+        colour: colour of the dots.
+    """
+    axes.plot(
+        _as_dots(numbers),
+        _as_dots(objectives),
+        solid_capstyle="round",
+        linewidth=4,
+        alpha=0.35,
+        color=colour,
+    )
+
+
 def draw_heat_map(
     axes: Any,
     values: Sequence[Sequence[float]],
@@ -263,15 +314,7 @@ def draw_heat_map(
         x_label: the name of the horizontal axis.
         y_label: the name of the vertical axis.
     """
-    magnitudes = [abs(value) for row in values for value in row if math.isfinite(value)]
-    if meaning == ACCURACY:
-        lower = 0.0
-        upper = 1.0
-    else:
-        # The same limit on both sides, so that 0 has the middle colour. 1e-6: the range
-        # must not be empty.
-        upper = max([*magnitudes, 1e-6])
-        lower = -upper
+    lower, upper = _choose_map_limits(values, meaning)
     image = axes.imshow(
         values,
         origin="lower",
@@ -283,6 +326,24 @@ def draw_heat_map(
     )
     axes.set(xlabel=x_label, ylabel=y_label)
     axes.figure.colorbar(image, ax=axes, label=meaning)
+
+
+def _choose_map_limits(
+    values: Sequence[Sequence[float]], meaning: str
+) -> tuple[float, float]:
+    """Return the values of the first and the last color of a map.
+
+    Args:
+        values: values of the map.
+        meaning: meaning of the colors; `ACCURACY` has the range 0 to 1.
+    """
+    if meaning == ACCURACY:
+        return 0.0, 1.0
+    magnitudes = [abs(value) for row in values for value in row if math.isfinite(value)]
+    # The same limit on both sides, so that 0 has the middle colour. 1e-6: the range must
+    # not be empty.
+    upper = max([*magnitudes, 1e-6])
+    return -upper, upper
 
 
 def format_axis_title(name: str, unit: str) -> str:
@@ -329,12 +390,11 @@ def draw_marks(picture: Any, shapes: Sequence[Shape]) -> Floats:
     Returns:
         The drawing (h, w, 3), float32 in [0, 1].
     """
-    levels = to_8bit(picture)
-    height, width = levels.shape[:2]
+    original = Image.fromarray(to_8bit(picture))
     # rounded up, so that the longest side has MIN_IMAGE_SIDE pixels at least
-    factor = max(1, math.ceil(MIN_IMAGE_SIDE / max(height, width)))
-    size = (width * factor, height * factor)
-    image = Image.fromarray(levels).resize(size, Image.Resampling.NEAREST)
+    factor = max(1, math.ceil(MIN_IMAGE_SIDE / max(original.size)))
+    size = (original.width * factor, original.height * factor)
+    image = original.resize(size, Image.Resampling.NEAREST)
     # True masks are drawn last, so that they stay visible (False sorts before True).
     for shape in sorted(shapes, key=lambda shape: shape.true):
         if shape.mask is not None:
@@ -342,9 +402,8 @@ def draw_marks(picture: Any, shapes: Sequence[Shape]) -> Floats:
     font = ImageFont.load_default(max(size) // LETTERS_PER_SIDE)
     _draw_boxes(image, shapes, factor, font)
     panels = [image, *_make_map_panels(shapes, size, font)]
-    sheet: Floats = np.hstack(
-        [np.asarray(panel, dtype=np.float32) for panel in panels]
-    ) / np.float32(255.0)
+    sheet_levels = np.hstack([np.asarray(panel, dtype=np.float32) for panel in panels])
+    sheet: Floats = sheet_levels / np.float32(255.0)
     return sheet
 
 
@@ -402,9 +461,8 @@ def _draw_boxes(
         if shape.box is not None
     ]
     for shape, corners in boxes:
-        draw.rectangle(
-            corners, outline=TRUE_COLOR if shape.true else PREDICTED_COLOR, width=2
-        )
+        color = TRUE_COLOR if shape.true else PREDICTED_COLOR
+        draw.rectangle(corners, outline=color, width=2)
     # Boxes of the texts that were written so far, which the next text must not cover.
     text_boxes: list[tuple[int, int, int, int]] = []
     for shape, corners in boxes:
@@ -425,26 +483,49 @@ def _make_map_panels(
         size: (width, height) of each returned image in pixels.
         font: font of the texts.
     """
-    maps = sorted(
-        (shape for shape in shapes if shape.map is not None),
-        key=lambda shape: not shape.true,  # False, of the true map, sorts first
-    )
-    if not maps:
+    shapes_with_map = [shape for shape in shapes if shape.map is not None]
+    # False, of the true map, sorts first
+    shapes_with_map.sort(key=lambda shape: not shape.true)
+    if not shapes_with_map:
         return []
-    lower = float(maps[0].map.min())
-    upper = float(maps[0].map.max())
-    panels = []
-    for shape in maps:
-        values = np.asarray(shape.map, dtype=np.float64)
-        value_range = max(upper - lower, 1e-12)  # not 0, for a constant map
-        greys = np.clip((values - lower) / value_range, 0.0, 1.0)
-        levels = np.rint(255.0 * np.nan_to_num(greys)).astype(np.uint8)
-        grey_image = Image.fromarray(levels).resize(size, Image.Resampling.NEAREST)
-        panel = grey_image.convert("RGB")
-        frame = (0, 0, size[0] - 1, size[1] - 1)
-        _write_label(ImageDraw.Draw(panel), shape, frame, size, font, [])
-        panels.append(panel)
-    return panels
+    first_map = shapes_with_map[0].map
+    limits = (float(first_map.min()), float(first_map.max()))
+    return [_make_map_panel(shape, limits, size, font) for shape in shapes_with_map]
+
+
+def _make_map_panel(
+    shape: Shape, limits: tuple[float, float], size: tuple[int, int], font: Any
+) -> Image.Image:
+    """Return the map of a shape as a grey image with its text.
+
+    Args:
+        shape: a mark with a map (h, w).
+        limits: the values that are black and white.
+        size: (width, height) of the image in pixels.
+        font: font of the text.
+    """
+    lower, upper = limits
+    grey_image = _make_grey_image(shape.map, lower, upper)
+    panel = grey_image.resize(size, Image.Resampling.NEAREST).convert("RGB")
+    frame = (0, 0, size[0] - 1, size[1] - 1)
+    _write_label(ImageDraw.Draw(panel), shape, frame, size, font, text_boxes=[])
+    return panel
+
+
+def _make_grey_image(values: Any, lower: float, upper: float) -> Image.Image:
+    """Return a map (h, w) as a gray image.
+
+    Args:
+        values: the map.
+        lower: the value that is black.
+        upper: the value that is white.
+    """
+    value_range = max(upper - lower, 1e-12)  # not 0, for a constant map
+    greys = np.clip(
+        (np.asarray(values, dtype=np.float64) - lower) / value_range, 0.0, 1.0
+    )
+    levels = np.rint(255.0 * np.nan_to_num(greys)).astype(np.uint8)
+    return Image.fromarray(levels)
 
 
 def _to_pixel_corners(
@@ -499,23 +580,39 @@ def _write_label(
     letters = [round(side) for side in draw.textbbox((0, 0), text, font=font)]
     width = letters[2] - letters[0] + 2 * LABEL_MARGIN
     height = letters[3] - letters[1] + 2 * LABEL_MARGIN
+    x, y = _choose_label_corner(shape, corners, (width, height), size, text_boxes)
+    background = TRUE_COLOR if shape.true else PREDICTED_COLOR
+    draw.rectangle((x, y, x + width, y + height), fill=background)
+    # The letters begin a little to the right of and below the position of the text.
+    position = (x + LABEL_MARGIN - letters[0], y + LABEL_MARGIN - letters[1])
+    draw.text(position, text, fill=(0, 0, 0), font=font)
+    return x, y, x + width, y + height
+
+
+def _choose_label_corner(
+    shape: Shape,
+    corners: tuple[int, int, int, int],
+    text_size: tuple[int, int],
+    size: tuple[int, int],
+    text_boxes: Sequence[tuple[int, int, int, int]],
+) -> tuple[int, int]:
+    """Return the upper left corner (x, y) of a text with its background.
+
+    Args:
+        shape: the shape that the text belongs to.
+        corners: (left, top, right, bottom) of the shape.
+        text_size: (width, height) of the text.
+        size: (width, height) of the image.
+        text_boxes: the boxes of texts written before.
+    """
+    width, height = text_size
     left, top, _, bottom = corners
     # the text begins at the left side of the shape, but stays inside of the image
     x = max(0, min(left, size[0] - width))
     max_y = max(0, size[1] - height)
     preferred_y = bottom if shape.true else top - height
     preferred_y = max(0, min(preferred_y, size[1] - height))
-    y = _find_free_height(x, preferred_y, max_y, (width, height), text_boxes)
-    background = TRUE_COLOR if shape.true else PREDICTED_COLOR
-    draw.rectangle((x, y, x + width, y + height), fill=background)
-    # The letters begin a little to the right of and below the position of the text.
-    draw.text(
-        (x + LABEL_MARGIN - letters[0], y + LABEL_MARGIN - letters[1]),
-        text,
-        fill=(0, 0, 0),
-        font=font,
-    )
-    return x, y, x + width, y + height
+    return x, _find_free_height(x, preferred_y, max_y, text_size, text_boxes)
 
 
 def _find_free_height(
@@ -537,19 +634,33 @@ def _find_free_height(
         size: (width, height) of the text.
         text_boxes: (x0, y0, x1, y1) of the other texts.
     """
-    width, height = size
-
-    def is_free(y: int) -> bool:
-        """Return whether the text would cover no other one at this height."""
-        # it lies to the right or left of each other text, or below or above it
-        return all(
-            x > x1 or x0 > x + width or y > y1 or y0 > y + height
-            for x0, y0, x1, y1 in text_boxes
-        )
-
     # by distance from the preferred height; of two at the same distance, the upper one
     nearest_first = sorted(range(max_y + 1), key=lambda y: (abs(y - preferred_y), y))
-    return next(filter(is_free, nearest_first), preferred_y)
+    for y in nearest_first:
+        if _is_free_position((x, y), size, text_boxes):
+            return y
+    return preferred_y
+
+
+def _is_free_position(
+    corner: tuple[int, int],
+    size: tuple[int, int],
+    text_boxes: Sequence[tuple[int, int, int, int]],
+) -> bool:
+    """Return whether a text would cover no other one at a position.
+
+    Args:
+        corner: (left, top) of the text.
+        size: (width, height) of the text.
+        text_boxes: (x0, y0, x1, y1) of the other texts.
+    """
+    x, y = corner
+    width, height = size
+    # it lies to the right or left of each other text, or below or above it
+    return all(
+        x > x1 or x0 > x + width or y > y1 or y0 > y + height
+        for x0, y0, x1, y1 in text_boxes
+    )
 
 
 # In pixels: the gap between tiles, and the heights of a line of text and of its font.
@@ -583,9 +694,8 @@ def make_contact_sheet(
     n_columns = choose_column_count(len(pictures))
     n_rows = math.ceil(len(pictures) / n_columns)
     # one more gap is at the left and above
-    sheet = Image.new(
-        "RGB", (GAP + n_columns * cell_width, GAP + n_rows * cell_height), "white"
-    )
+    sheet_size = (GAP + n_columns * cell_width, GAP + n_rows * cell_height)
+    sheet = Image.new("RGB", sheet_size, "white")
     for index, picture in enumerate(pictures):
         row, column = divmod(index, n_columns)
         corner = (GAP + column * cell_width, GAP + row * cell_height)

@@ -155,20 +155,10 @@ def write_sheets(
         InputError: there is no such paper, or more sheets would be needed.
         FileFormatError: the profile is not that of an RGB printer.
     """
-    if paper not in PAPERS:
-        raise InputError(f"paper: expected one of {', '.join(PAPERS)}, got {paper!r}")
-    if not 1 <= max_sheets <= MAX_SHEETS:
-        raise InputError(
-            f"sheets: expected a whole number from 1 to {MAX_SHEETS}, got {max_sheets}"
-        )
+    _check_sheet_arguments(paper, max_sheets)
     convert = None if profile is None else _load_color_conversion(profile)
     pages = list(arrange_pages(pieces, PAPERS[paper]))
-    if len(pages) > max_sheets:
-        raise InputError(
-            f"sheets: it takes {len(pages)} sheets of {paper}, but at most "
-            f"{max_sheets} are written; raise the limit (`sheets={len(pages)}`), or "
-            "use a larger `paper` or a smaller `size`"
-        )
+    _check_sheet_count(len(pages), max_sheets, paper)
     with PdfPages(path, metadata={"Title": title, "CreationDate": None}) as file:
         file.savefig(_make_cover(pieces, title, PAPERS[paper], len(pages), profile))
         for number, page in enumerate(pages, 1):
@@ -179,6 +169,34 @@ def write_sheets(
     n_cover_pages = 1
     n_last_pages = 0 if make_last_page is None else 1
     return n_cover_pages + len(pages) + n_last_pages
+
+
+def _check_sheet_arguments(paper: str, max_sheets: int) -> None:
+    """Check the name of the paper and the maximum number of sheets.
+
+    Raises:
+        InputError: there is no such paper, or the number is out of range.
+    """
+    if paper not in PAPERS:
+        raise InputError(f"paper: expected one of {', '.join(PAPERS)}, got {paper!r}")
+    if not 1 <= max_sheets <= MAX_SHEETS:
+        raise InputError(
+            f"sheets: expected a whole number from 1 to {MAX_SHEETS}, got {max_sheets}"
+        )
+
+
+def _check_sheet_count(n_sheets: int, max_sheets: int, paper: str) -> None:
+    """Check that no more sheets are needed than may be written.
+
+    Raises:
+        InputError: more are; the message has the name of the paper.
+    """
+    if n_sheets > max_sheets:
+        raise InputError(
+            f"sheets: it takes {n_sheets} sheets of {paper}, but at most "
+            f"{max_sheets} are written; raise the limit (`sheets={n_sheets}`), or "
+            "use a larger `paper` or a smaller `size`"
+        )
 
 
 def _load_color_conversion(profile: Path) -> Any:
@@ -258,15 +276,24 @@ def arrange_pages(
             x = 0.0
             y = 0.0
             row_height = 0.0
-        # The position of a part is that of its corner inside of bleed and marks.
-        frame_width, frame_height = part.piece.frame_size_mm
-        page.append(
-            replace(part, x=MARGIN + x + frame_width, y=MARGIN + y + frame_height)
-        )
+        page.append(_move_to(part, x, y))
         x = x + part_width
         row_height = max(row_height, part_height)
     if page:
         yield page
+
+
+def _move_to(part: PlacedPart, x: float, y: float) -> PlacedPart:
+    """Return a part with its upper left corner, marks included, at a position.
+
+    Args:
+        part: the part.
+        x: position inside the margins of the page, in millimetres.
+        y: position below the upper margin.
+    """
+    # The position of a part is that of its corner inside of bleed and marks.
+    frame_width, frame_height = part.piece.frame_size_mm
+    return replace(part, x=MARGIN + x + frame_width, y=MARGIN + y + frame_height)
 
 
 def _cut_piece(piece: Piece, width: float, height: float) -> Iterator[PlacedPart]:
@@ -394,8 +421,38 @@ def _make_cover(
     x = MARGIN
     y = MARGIN + 5.0
     axes.text(x, y, title, fontsize=14, va="top")
+    square_top = y + 15.0  # below the title
+    square_bottom = y + 15.0 + SQUARE
+    _draw_measured_square(axes, x, square_top, square_bottom)
+    text = "\n".join(_list_cover_lines(pieces, sheets, profile))
+    axes.text(x, square_bottom + 10.0, text, fontsize=9, va="top", linespacing=1.6)
+    _draw_ruler(axes, paper)
+    return figure
+
+
+def _draw_measured_square(axes: Axes, left: float, top: float, bottom: float) -> None:
+    """Draw the square that the user measures to check the scale of the printer.
+
+    Args:
+        axes: axes of the page, in millimetres.
+        left, top, bottom: sides of the square, in millimetres.
+    """
+    right = left + SQUARE
+    _draw_line(axes, [left, right, right, left, left], [top, top, bottom, bottom, top])
+
+
+def _list_cover_lines(
+    pieces: Sequence[Piece], sheets: int, profile: Path | None
+) -> list[str]:
+    """Return the lines that explain how to print, and the list of pieces.
+
+    Args:
+        pieces: what is printed.
+        sheets: number of sheets that follow.
+        profile: the ICC profile to which colors were converted; None for sRGB.
+    """
     colours = "sRGB" if profile is None else f"converted from sRGB by {profile.name}"
-    lines = [
+    return [
         f'{sheets} sheets follow. Print all pages at 100 % ("actual size"), then '
         "measure this square: "
         f"{SQUARE:g} mm a side.",
@@ -404,22 +461,22 @@ def _make_cover(
         "",
         *CHECKLIST,
         "",
-        *[
-            f"{piece.name}: {piece.size[0]:.1f} x {piece.size[1]:.1f} mm"
-            for piece in pieces[:MAX_LISTED_PIECES]
-        ],
+        *_list_piece_lines(pieces),
     ]
+
+
+def _list_piece_lines(pieces: Sequence[Piece]) -> list[str]:
+    """Return a line with name and size for each piece, up to `MAX_LISTED_PIECES`, and
+    one with the number of further pieces.
+    """
+    lines = []
+    for piece in pieces[:MAX_LISTED_PIECES]:
+        width, height = piece.size
+        lines.append(f"{piece.name}: {width:.1f} x {height:.1f} mm")
     n_unlisted = len(pieces) - MAX_LISTED_PIECES
     if n_unlisted > 0:
         lines.append(f"and {n_unlisted} more")
-    # the square to measure, below the title
-    top = y + 15.0
-    right = x + SQUARE
-    bottom = y + 15.0 + SQUARE
-    _draw_line(axes, [x, right, right, x, x], [top, top, bottom, bottom, top])
-    axes.text(x, bottom + 10.0, "\n".join(lines), fontsize=9, va="top", linespacing=1.6)
-    _draw_ruler(axes, paper)
-    return figure
+    return lines
 
 
 def _draw_ruler(axes: Axes, paper: tuple[float, float]) -> None:
@@ -446,21 +503,12 @@ def _draw_part(axes: Axes, part: PlacedPart, convert: Any) -> None:
         convert: converts colours from sRGB to those of the printer; None leaves them.
     """
     piece = part.piece
-    x0, x1, y0, y1 = part.pixel_bounds
-    bleed_x, bleed_y = piece.bleed
-    pixel_width, pixel_height = piece.pixel_size_mm
-    # the part with the bleed around it
-    picture = piece.picture[y0 - bleed_y : y1 + bleed_y, x0 - bleed_x : x1 + bleed_x]
-    if convert is not None:
-        picture = np.asarray(ImageCms.applyTransform(Image.fromarray(picture), convert))
-    # Left and right, top and bottom edge in millimetres: `trim` of the part without its
-    # bleed, `outer` with it.
-    trim_x = part.x, part.x + (x1 - x0) * pixel_width
-    trim_y = part.y, part.y + (y1 - y0) * pixel_height
-    outer_x = trim_x[0] - bleed_x * pixel_width, trim_x[1] + bleed_x * pixel_width
-    outer_y = trim_y[0] - bleed_y * pixel_height, trim_y[1] + bleed_y * pixel_height
+    # `trim` are the edges of the part without its bleed, `outer` those with it
+    trim_x, trim_y = _find_trim_edges(part)
+    outer_x = _add_bleed(trim_x, piece.bleed[0] * piece.pixel_size_mm[0])
+    outer_y = _add_bleed(trim_y, piece.bleed[1] * piece.pixel_size_mm[1])
     axes.imshow(
-        picture,
+        _cut_out_with_bleed(part, convert),
         # left, right, bottom, top: y grows downwards on the page
         extent=(outer_x[0], outer_x[1], outer_y[1], outer_y[0]),
         interpolation="none",
@@ -468,8 +516,44 @@ def _draw_part(axes: Axes, part: PlacedPart, convert: Any) -> None:
     )
     _draw_cut_marks(axes, trim_x, trim_y, outer_x, outer_y)
     if piece.cut_mask is not None:
+        x0, x1, y0, y1 = part.pixel_bounds
         _draw_cut_line(axes, part, piece.cut_mask[y0:y1, x0:x1])
     axes.text(part.x, outer_y[0] - MARK_GAP, part.name, fontsize=6, va="bottom")
+
+
+Edges = tuple[float, float]  # left and right, or top and bottom, in millimetres
+
+
+def _find_trim_edges(part: PlacedPart) -> tuple[Edges, Edges]:
+    """Return left and right, and top and bottom edge of a part without its bleed."""
+    x0, x1, y0, y1 = part.pixel_bounds
+    pixel_width, pixel_height = part.piece.pixel_size_mm
+    x_edges = (part.x, part.x + (x1 - x0) * pixel_width)
+    y_edges = (part.y, part.y + (y1 - y0) * pixel_height)
+    return x_edges, y_edges
+
+
+def _add_bleed(edges: Edges, bleed: float) -> Edges:
+    """Return two edges, each moved outwards by the width of the bleed."""
+    first, last = edges
+    return first - bleed, last + bleed
+
+
+def _cut_out_with_bleed(part: PlacedPart, convert: Any) -> Bytes:
+    """Return the picture of a part with the bleed around it, (h, w, 3) uint8.
+
+    Args:
+        part: the part.
+        convert: converts colours from sRGB to those of the printer; None leaves them.
+    """
+    x0, x1, y0, y1 = part.pixel_bounds
+    bleed_x, bleed_y = part.piece.bleed
+    picture = part.piece.picture[
+        y0 - bleed_y : y1 + bleed_y, x0 - bleed_x : x1 + bleed_x
+    ]
+    if convert is not None:
+        return np.asarray(ImageCms.applyTransform(Image.fromarray(picture), convert))
+    return picture
 
 
 def _draw_cut_marks(
@@ -494,17 +578,18 @@ def _draw_cut_marks(
     outwards = (-1.0, 1.0)  # direction away from the part at its first and last edge
     for x, edge_x, sign_x in zip(trim_x, outer_x, outwards, strict=True):
         for y, edge_y, sign_y in zip(trim_y, outer_y, outwards, strict=True):
-            # begin and end of the horizontal and of the vertical mark
-            mark_x = [
-                edge_x + sign_x * MARK_GAP,
-                edge_x + sign_x * (MARK_GAP + MARK_LENGTH),
-            ]
-            mark_y = [
-                edge_y + sign_y * MARK_GAP,
-                edge_y + sign_y * (MARK_GAP + MARK_LENGTH),
-            ]
-            _draw_line(axes, mark_x, [y, y])
-            _draw_line(axes, [x, x], mark_y)
+            _draw_line(axes, _find_mark_ends(edge_x, sign_x), [y, y])
+            _draw_line(axes, [x, x], _find_mark_ends(edge_y, sign_y))
+
+
+def _find_mark_ends(edge: float, sign: float) -> list[float]:
+    """Return the begin and the end of a cut mark in millimetres, along one axis.
+
+    Args:
+        edge: the edge with bleed, from which it leads away.
+        sign: its direction, 1 or -1.
+    """
+    return [edge + sign * MARK_GAP, edge + sign * (MARK_GAP + MARK_LENGTH)]
 
 
 def _draw_cut_line(axes: Axes, part: PlacedPart, inside: Mask) -> None:

@@ -25,6 +25,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from html import escape
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -259,18 +260,14 @@ def collect_facts(result: Result, view: ShownResult) -> dict[str, str]:
         result: the result.
         view: its view, with facts of its own.
     """
-    renders = getattr(result, "renders", None)
-    seconds = getattr(result, "seconds", None)
-    n_renders = sum(renders.values()) if isinstance(renders, Mapping) else renders
-    environment = getattr(result, "environment", "")
-    # The view lists several environments, and this one is among them.
-    if "environments" in view.facts:
-        environment = ""
     common_facts = {
-        "environment": environment,
-        "renders": "" if n_renders is None else str(n_renders),
+        # The view lists several environments, and this one is among them.
+        "environment": ""
+        if "environments" in view.facts
+        else getattr(result, "environment", ""),
+        "renders": _format_render_count(result),
         "workers": wording.format_workers(getattr(result, "shared", None)),
-        "time": wording.format_seconds(seconds["total"]) if seconds else "",
+        "time": _format_total_time(result),
         "seed": str(getattr(result, "seed", "")),
         **result.facts(),
     }
@@ -278,6 +275,19 @@ def collect_facts(result: Result, view: ShownResult) -> dict[str, str]:
     # several have: so facts of the view come first, and with its texts.
     facts = {**view.facts, **common_facts, **view.facts}
     return {name: text for name, text in facts.items() if text}
+
+
+def _format_render_count(result: Result) -> str:
+    """Return the number of renders of a run as text; "" if it is unknown."""
+    renders = getattr(result, "renders", None)
+    n_renders = sum(renders.values()) if isinstance(renders, Mapping) else renders
+    return "" if n_renders is None else str(n_renders)
+
+
+def _format_total_time(result: Result) -> str:
+    """Return the time that a run took as text; "" if it is unknown."""
+    seconds = getattr(result, "seconds", None)
+    return wording.format_seconds(seconds["total"]) if seconds else ""
 
 
 def make_default_view(result: Result) -> ShownResult:
@@ -289,18 +299,15 @@ def make_default_view(result: Result) -> ShownResult:
     values = {
         name: getattr(result, name) for name in type(result).get_described_fields()
     }
-    tables = {name: value for name, value in values.items() if _is_table(value)}
-    facts = _find_plain_facts(result, values, tables)
+    row_lists = {name: value for name, value in values.items() if _is_table(value)}
+    facts = _find_plain_facts(result, values, row_lists)
+    tables = [_make_table(name, rows) for name, rows in row_lists.items()]
+    names_of_facts = {name for name, text in facts.items() if text}
     # pairs of an object with fields, and the names of its fields that are on the page
-    objects_with_words: list[tuple[Fields, set[str]]] = [
-        (result, {name for name, text in facts.items() if text})
-    ]
-    sections = []
-    for name, rows in tables.items():
-        table = _make_table(name, rows)
-        sections.append(table)
+    objects_with_words: list[tuple[Fields, set[str]]] = [(result, names_of_facts)]
+    for rows, table in zip(row_lists.values(), tables, strict=True):
         objects_with_words.append((rows[0], set(table.column_heads)))
-    sections.append(_explain_words(objects_with_words))
+    sections = [*tables, _explain_words(objects_with_words)]
     # a result without a summary in words has its status as the statement
     brief = result.outcome_summary or str(values.get("ending", "done"))
     statement = f"{brief[:1].upper()}{brief[1:]}."
@@ -341,12 +348,7 @@ def _make_table(name: str, rows: Sequence[Fields]) -> ResultPart:
         name: name of the field that has the rows.
         rows: the rows, which may have different fields.
     """
-    names = dict.fromkeys(name for row in rows for name in type(row).model_fields)
-    columns = [
-        column
-        for column in names
-        if any(_format_value(getattr(row, column, None)) for row in rows)
-    ]
+    columns = _find_filled_columns(rows)
     cells = [
         [_format_value(getattr(row, column, None)) for column in columns]
         for row in rows
@@ -357,6 +359,16 @@ def _make_table(name: str, rows: Sequence[Fields]) -> ResultPart:
         rows=cells,
         folded=len(rows) > MAX_UNFOLDED_ROWS,
     )
+
+
+def _find_filled_columns(rows: Sequence[Fields]) -> list[str]:
+    """Return the names of the fields that some row has with a value that is not empty."""
+    names = dict.fromkeys(name for row in rows for name in type(row).model_fields)
+    return [
+        column
+        for column in names
+        if any(_format_value(getattr(row, column, None)) for row in rows)
+    ]
 
 
 def _explain_words(
@@ -401,18 +413,28 @@ def _format_value(value: object) -> str:
             {name: getattr(value, name) for name in type(value).model_fields}
         )
     if isinstance(value, Mapping):
-        text_by_name = {
-            _format_name(str(name)).lower(): _format_value(item)
-            for name, item in value.items()
-        }
-        pairs = [f"{name} {text}" for name, text in text_by_name.items() if text]
-        return ", ".join(pairs)
+        return _format_mapping(value)
     if isinstance(value, (list, tuple)):
-        is_range = len(value) == 2 and all(isinstance(item, float) for item in value)
-        texts = [_format_value(item) for item in value]
-        separator = " to " if is_range else "; "
-        return separator.join(text for text in texts if text)
+        return _format_items(value)
     return str(value)
+
+
+def _format_mapping(mapping: Mapping[Any, object]) -> str:
+    """Return a mapping as "name value" pairs, without those that are empty."""
+    text_by_name = {
+        _format_name(str(name)).lower(): _format_value(item)
+        for name, item in mapping.items()
+    }
+    pairs = [f"{name} {text}" for name, text in text_by_name.items() if text]
+    return ", ".join(pairs)
+
+
+def _format_items(items: Sequence[object]) -> str:
+    """Return two floats as a range, and items of other lists with semicolons."""
+    is_range = len(items) == 2 and all(isinstance(item, float) for item in items)
+    texts = [_format_value(item) for item in items]
+    separator = " to " if is_range else "; "
+    return separator.join(text for text in texts if text)
 
 
 def _format_name(name: str) -> str:
@@ -481,10 +503,10 @@ def make_case_claim(
         spent: the effort of the search as text; None for a known scene that was only
             rendered again.
     """
-    # the count behind the claim
-    extent = make_rate_extent("fresh renders that count as a success", rate)
     reason = REASON_OF_ENDING.get(ending, f"it ended as {ending!r}")
     no_claim = make_no_claim(reason, f"This is about {name}.")
+    # the count behind the claim
+    extent = make_rate_extent("fresh renders that count as a success", rate)
     if rate is None:
         return no_claim
     rate_text = wording.format_rate(rate)
@@ -492,16 +514,13 @@ def make_case_claim(
         statement = f"{name}: an adversarial scene holds in {rate_text}."
         return make_claim("found", statement, extent)
     found_nothing = ending in FAILED_SEARCH_ENDINGS
-    was_searched = spent is not None
-    if not was_searched and (found_nothing or ending == "not verified"):
+    if spent is None and (found_nothing or ending == "not verified"):
         # Nothing follows about other scenes, so only the rate of this one is claimed.
         statement = f"{name}: the adversarial scene is not confirmed, in {rate_text}."
         return make_claim("measured", statement, extent)
     if found_nothing:
-        statement = (
-            f"{name}: no failure was found; the best configuration counts in "
-            f"{rate_text}. Searched were {spent}. {NO_PROOF}"
-        )
+        best = f"no failure was found; the best configuration counts in {rate_text}"
+        statement = f"{name}: {best}. Searched were {spent}. {NO_PROOF}"
         return make_claim("not found", statement, extent)
     return no_claim
 
@@ -669,19 +688,10 @@ def make_notebook_html(
         view: the view of the result, with its sentence, charts and tables.
         pictures: images (H, W, 3) by name, which come first; None for none.
     """
-    figures = []
-    for name, image in (pictures or {}).items():
-        picture = _make_image(encode_png(image), DISPLAY_WIDTH, name)
-        caption = make_element("figcaption", name)
-        figures.append(
-            make_element("figure", picture, caption, style="display:inline-block")
-        )
-    figure = render_result_figure(view)
-    chart = None
-    if figure:
-        chart = _make_image(
-            figure["png"], 2 * DISPLAY_WIDTH, "the numbers of the table"
-        )
+    figures = [
+        _make_figure_html(name, image) for name, image in (pictures or {}).items()
+    ]
+    chart = _make_chart_image(view)
     sections = [
         _make_section_html(part)
         for part in view.sections
@@ -692,25 +702,45 @@ def make_notebook_html(
     )
 
 
+def _make_chart_image(view: ShownResult) -> Html | None:
+    """Return the charts of a result as an image element; None if it has none."""
+    figure = render_result_figure(view)
+    if not figure:
+        return None
+    return _make_image(figure["png"], 2 * DISPLAY_WIDTH, "the numbers of the table")
+
+
+def _make_figure_html(name: str, image: ArrayLike) -> Html:
+    """Return an image (H, W, 3) as HTML, with its name as the caption."""
+    picture = _make_image(encode_png(image), DISPLAY_WIDTH, name)
+    caption = make_element("figcaption", name)
+    return make_element("figure", picture, caption, style="display:inline-block")
+
+
 def _make_section_html(part: ResultPart) -> Html:
     """Return the texts and the table of a part of a result as HTML."""
     # the texts of a chart describe it, and the chart itself is not displayed here
     texts = part.text if part.draw is None else ()
     children = [make_element("p", text) for text in texts if text]
     if part.rows:
-        heads = make_element(
-            "tr", *(make_element("th", cell) for cell in part.column_heads)
-        )
-        head = make_element("thead", heads) if part.column_heads else None
-        rows = [
-            make_element("tr", *(make_element("td", cell) for cell in row))
-            for row in part.rows
-        ]
-        children.append(make_element("table", head, make_element("tbody", *rows)))
+        children.append(_make_table_html(part))
     if part.folded:
         return make_element("details", make_element("summary", part.title), *children)
     title = make_element("p", make_element("b", part.title)) if part.title else None
     return make_element("div", title, *children)
+
+
+def _make_table_html(part: ResultPart) -> Html:
+    """Return the table of a part of a result as HTML."""
+    heads = make_element(
+        "tr", *(make_element("th", cell) for cell in part.column_heads)
+    )
+    head = make_element("thead", heads) if part.column_heads else None
+    rows = [
+        make_element("tr", *(make_element("td", cell) for cell in row))
+        for row in part.rows
+    ]
+    return make_element("table", head, make_element("tbody", *rows))
 
 
 def render_result_figure(view: ShownResult) -> Figures:
@@ -801,26 +831,10 @@ def make_chart_svg(
         width: width in CSS pixels.
         height: height in CSS pixels.
     """
-
-    def on_figure(figure: Figure) -> None:
-        """Draw the chart, with a single legend above it and without a title."""
-        axes = figure.subplots()
-        draw(axes)
-        axes.set_title("")
-        # the figure gets a legend above the axes in place of all others
-        axes_legend = axes.get_legend()
-        if axes_legend is not None:
-            axes_legend.remove()
-        for legend in [*figure.legends]:
-            legend.remove()
-        columns = 1 if width == NARROW_WIDTH else 2
-        figure.legend(
-            loc="outside upper left", ncols=columns, labelcolor=COLORS["soft"]
-        )
-
     # matplotlib writes SVG files with 72 pixels for an inch
     size_in_inches = (width / 72, height / 72)
-    files = render_figure(on_figure, size_in_inches, kinds=("svg",), style=STYLE)
+    draw_page_chart = partial(_draw_page_chart, draw, width)
+    files = render_figure(draw_page_chart, size_in_inches, kinds=("svg",), style=STYLE)
     return make_element(
         "svg",
         make_element("title", description),
@@ -831,6 +845,40 @@ def make_chart_svg(
         role="img",
         aria_label=description,
     )
+
+
+def _draw_page_chart(
+    draw: Callable[[Axes], object], width: int, figure: Figure
+) -> None:
+    """Draw a chart, with a single legend above it and without a title.
+
+    Args:
+        draw: function that draws on axes of matplotlib.
+        width: width in CSS pixels.
+        figure: the empty figure.
+    """
+    axes = figure.subplots()
+    draw(axes)
+    axes.set_title("")
+    # the figure gets a legend above the axes in place of all others
+    axes_legend = axes.get_legend()
+    if axes_legend is not None:
+        axes_legend.remove()
+    for legend in [*figure.legends]:
+        legend.remove()
+    columns = 1 if width == NARROW_WIDTH else 2
+    figure.legend(loc="outside upper left", ncols=columns, labelcolor=COLORS["soft"])
+
+
+_UNNEEDED_IN_SVG = (
+    r"<clipPath.*?</clipPath>",
+    r"<!--.*?-->",
+    r' clip-path="[^"]*"',
+    # Digits after the first decimal: they follow "1.2", and are inside of a tag, since
+    # ">" is the next angle bracket.
+    r"(?<=\d\.\d)\d+(?=[^<>]*>)",
+)
+"""Patterns of what is left out of an SVG file that is inserted into a page."""
 
 
 def _make_inline_svg(svg: str, prefix: str) -> Html:
@@ -847,15 +895,16 @@ def _make_inline_svg(svg: str, prefix: str) -> Html:
     """
     # from the first group of shapes to the end of the file
     shapes = svg[svg.index("<g ") : svg.rindex("</svg>")]
-    unneeded_patterns = (
-        r"<clipPath.*?</clipPath>",
-        r"<!--.*?-->",
-        r' clip-path="[^"]*"',
-        # Digits after the first decimal: they follow "1.2", and are inside of a tag,
-        # since ">" is the next angle bracket.
-        r"(?<=\d\.\d)\d+(?=[^<>]*>)",
-    )
-    shapes = re.sub("|".join(unneeded_patterns), "", shapes, flags=re.DOTALL)
+    shapes = re.sub("|".join(_UNNEEDED_IN_SVG), "", shapes, flags=re.DOTALL)
+    shapes = _prefix_ids(shapes, prefix)
+    shapes = re.sub(r"<defs>\s*</defs>", "", shapes)
+    for name, color in (*COLORS.items(), *FIGURE_COLORS.items()):
+        shapes = shapes.replace(color, f"var(--{name})")
+    return Html(shapes)
+
+
+def _prefix_ids(shapes: str, prefix: str) -> str:
+    """Return markup with a prefix before its ids, without ids that nothing refers to."""
     # Only `href` still refers to ids, since the clipping paths are gone.
     referenced_ids = set(re.findall(r'href="#([^"]+)"', shapes))
     # The ids first, then the references to them, get the prefix.
@@ -864,8 +913,4 @@ def _make_inline_svg(svg: str, prefix: str) -> Html:
         lambda match: f' id="{prefix}{match[1]}"' if match[1] in referenced_ids else "",
         shapes,
     )
-    shapes = re.sub(r'href="#', f'href="#{prefix}', shapes)
-    shapes = re.sub(r"<defs>\s*</defs>", "", shapes)
-    for name, color in (*COLORS.items(), *FIGURE_COLORS.items()):
-        shapes = shapes.replace(color, f"var(--{name})")
-    return Html(shapes)
+    return re.sub(r'href="#', f'href="#{prefix}', shapes)

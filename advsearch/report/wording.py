@@ -20,6 +20,7 @@ if TYPE_CHECKING:
         Formation,
         Interval,
         SharedWork,
+        TwinAgreement,
         TwinEvidence,
         VerifiedRate,
     )
@@ -145,8 +146,18 @@ def format_percent_number(fraction: float, max_decimals: int = MAX_DECIMALS) -> 
     if text not in ("0", "100"):
         return text
     # Even with `max_decimals` it was rounded to 0 or 100.
+    return _format_unreached_limit(text, decimals)
+
+
+def _format_unreached_limit(limit: str, decimals: int) -> str:
+    """Return a percentage that is too close to a limit to be told from it.
+
+    Args:
+        limit: the limit, "0" or "100".
+        decimals: number of decimals with which the percentage is rounded to it.
+    """
     last_digit = 10.0**-decimals  # such as 0.0001 for four decimals
-    if text == "0":
+    if limit == "0":
         return f"under {last_digit:.{decimals}f}"
     return f"over {100.0 - last_digit:.{decimals}f}"
 
@@ -210,25 +221,33 @@ def format_paired_rates(run: str, pair: Any) -> str:
     """
     clean = _format_accuracy(pair.clean)
     adversarial = _format_accuracy(pair.adversarial)
+    return (
+        f"{pair.model} is right in {clean} of the clean scene, and in {adversarial} "
+        f"with the adversarial scene of {run}: "
+        f"{_format_rate_difference(pair)}. "
+        f"Right in the clean one alone are {pair.clean_only} pairs, "
+        f"with the adversarial one alone {pair.adversarial_only}."
+    )
+
+
+def _format_rate_difference(pair: Any) -> str:
+    """Return the difference of paired rates in points, with its interval.
+
+    Args:
+        pair: `PairedRates`, whose difference is a fraction.
+    """
     lower, upper = (100.0 * bound for bound in pair.interval)
+    interval = f"{lower:.0f} to {upper:.0f}"
+    direction = "more"
     if pair.difference < 0:
         # The word "fewer" states the sign. The bounds are negated, and so swap places.
         interval = f"{-upper:.0f} to {-lower:.0f}"
         direction = "fewer"
-    else:
-        interval = f"{lower:.0f} to {upper:.0f}"
-        direction = "more"
-    doubt = ""
     contains_zero = not (lower > 0.0 or upper < 0.0)
-    if contains_zero:
-        doubt = "; that there is a difference is not shown"
+    doubt = "; that there is a difference is not shown" if contains_zero else ""
     return (
-        f"{pair.model} is right in {clean} of the clean scene, and in {adversarial} "
-        f"with the adversarial scene of {run}: "
         f"{abs(100.0 * pair.difference):.0f} points {direction} "
-        f"(95 % interval of pairs {interval}){doubt}. "
-        f"Right in the clean one alone are {pair.clean_only} pairs, "
-        f"with the adversarial one alone {pair.adversarial_only}."
+        f"(95 % interval of pairs {interval}){doubt}"
     )
 
 
@@ -366,6 +385,16 @@ def format_prediction(task: str, prediction: AnyPrediction) -> str:
         return f"{label} ({number})"
     if task != SEGMENTATION:
         return f"{label}, {number}"
+    return _format_segmentation(label, prediction)
+
+
+def _format_segmentation(label: str, prediction: AnyPrediction) -> str:
+    """Return a prediction of segmentation on one line.
+
+    Args:
+        label: the label that the prediction has in a table.
+        prediction: has the accuracy as its probability, and perhaps a payload.
+    """
     accuracy = f"accuracy over the object's pixels {percent(prediction.probability)}"
     outcome = get_outcome(getattr(prediction, "payload", None))
     if outcome is Outcome.MISSED:
@@ -451,6 +480,17 @@ def format_mistake(
         # the label is "mug elsewhere": "sees a mug elsewhere, and none where this mug
         # is"
         return f"sees {add_article(label)}, and none where {thing} is"
+    return _format_wrong_label(task, thing, label)
+
+
+def _format_wrong_label(task: str, thing: str, label: str) -> str:
+    """Return the prediction of a wrong label as a clause.
+
+    Args:
+        task: task of the model.
+        thing: phrase for the object in the clause.
+        label: label that the model predicts.
+    """
     if task == CLASSIFICATION:
         return f"calls {thing} {add_article(label)}"
     if task == COMMAND:
@@ -634,13 +674,18 @@ def format_workers(shared: SharedWork | None) -> str:
         alive = format_seconds(shared.alive)
         texts.append(f"busy {percent(shared.utilisation)} of {alive}")
     texts.append(f"loading took {format_seconds(shared.loading)}")
+    texts += _list_worker_events(shared)
+    return ", ".join(texts)
+
+
+def _list_worker_events(shared: SharedWork) -> list[str]:
+    """Return the events that happened to workers, with their counts."""
     counts = {
         "lost": shared.lost,
         "refused": shared.refused,
         "given out again": shared.retried,
     }
-    texts += [f"{count} {event}" for event, count in counts.items() if count]
-    return ", ".join(texts)
+    return [f"{count} {event}" for event, count in counts.items() if count]
 
 
 def format_formation(
@@ -654,23 +699,21 @@ def format_formation(
         gains: gains by scene, if each scene has its own. A scene is named by its object
             and environment, as in "mug, studio".
     """
-    height, width = formation.resolution
-    denoised = "not denoised"
-    if formation.denoiser != "none":
-        denoised = f"denoised ({formation.denoiser})"
-    description = (
-        f"{height} x {width} pixels, {formation.filter} filter, {denoised}, "
-        f"exposure {format_number(formation.exposure)} stops, "
-        f"sampler {formation.sampler}"
-    )
+    description = _describe_formation_without_gain(formation)
     if formation.gain is not None:
         return f"{description}, gain {format_number(formation.gain)}"
+    description += ", a gain for each scene"
+    gain_text = _format_gains(gains or {})
+    return f"{description}: {gain_text}" if gain_text else description
+
+
+def _format_gains(gains: Mapping[str, float]) -> str:
+    """Return gains by scene as text: ``mug, studio 1.35; bowl, studio 1.2``."""
     gain_texts = []
-    for scene, gain in (gains or {}).items():
+    for scene, gain in gains.items():
         scene_name = ", ".join(map(shorten_name, scene.split(", ")))
         gain_texts.append(f"{scene_name} {format_number(gain)}")
-    description += ", a gain for each scene"
-    return f"{description}: {'; '.join(gain_texts)}" if gain_texts else description
+    return "; ".join(gain_texts)
 
 
 def format_number(value: Any) -> str:
@@ -722,6 +765,19 @@ NO_TWINS = (
 )
 
 
+def _describe_formation_without_gain(formation: Formation) -> str:
+    """Return how images were computed, without the gain of their brightness."""
+    height, width = formation.resolution
+    denoised = "not denoised"
+    if formation.denoiser != "none":
+        denoised = f"denoised ({formation.denoiser})"
+    return (
+        f"{height} x {width} pixels, {formation.filter} filter, {denoised}, "
+        f"exposure {format_number(formation.exposure)} stops, "
+        f"sampler {formation.sampler}"
+    )
+
+
 def format_twin_evidence(evidence: TwinEvidence) -> str:
     """Return, in one or two sentences, how far results on renders hold for photographs.
 
@@ -739,6 +795,36 @@ def format_twin_evidence(evidence: TwinEvidence) -> str:
             f"How far this holds for photographs was not measured: "
             f"{_TWIN_MISMATCHES[evidence.match].format(run=name)}."
         )
+    return (
+        f"Photographs ({name}; {_describe_twins(row, evidence)}): this model was "
+        f"right or wrong on both in {format_estimate(row.agreement)} of "
+        f"{format_count(row.pairs, 'pair')} of {format_count(row.frames, 'frame')}. "
+        f"{_format_failing_twins(row)}"
+    )
+
+
+def _format_failing_twins(row: TwinAgreement) -> str:
+    """Return, in a sentence, how often a failing render was a failing photograph."""
+    failing = f"{row.both_wrong} of {row.wrong_twins}"  # of the wrong renders
+    if row.wrong_where_twin_wrong is None:
+        return (
+            "Too few renders failed to state how often a failing render "
+            f"is a failing photograph ({failing})."
+        )
+    return (
+        "A failing render was a failing photograph in "
+        f"{format_estimate(row.wrong_where_twin_wrong)} ({failing}); photographs failed "
+        f"in {format_estimate(row.photo_wrong)} at all."
+    )
+
+
+def _describe_twins(row: TwinAgreement, evidence: TwinEvidence) -> str:
+    """Return the objects and the surroundings of twins as text.
+
+    Args:
+        row: the row of the run of twins.
+        evidence: whether its object and surroundings are those of the result.
+    """
     objects = row.object or "all objects together"
     if not evidence.same_object:
         objects += ", not of this object"
@@ -747,22 +833,7 @@ def format_twin_evidence(evidence: TwinEvidence) -> str:
         surroundings = "composed over their photographs"
     if not evidence.same_surroundings:
         surroundings += ", not in these surroundings"
-    agreement = (
-        f"Photographs ({name}; {objects}; renders {surroundings}): this model was "
-        f"right or wrong on both in {format_estimate(row.agreement)} of "
-        f"{format_count(row.pairs, 'pair')} of {format_count(row.frames, 'frame')}."
-    )
-    failing = f"{row.both_wrong} of {row.wrong_twins}"  # of the wrong renders
-    if row.wrong_where_twin_wrong is None:
-        return (
-            f"{agreement} Too few renders failed to state how often a failing render "
-            f"is a failing photograph ({failing})."
-        )
-    return (
-        f"{agreement} A failing render was a failing photograph in "
-        f"{format_estimate(row.wrong_where_twin_wrong)} ({failing}); photographs failed "
-        f"in {format_estimate(row.photo_wrong)} at all."
-    )
+    return f"{objects}; renders {surroundings}"
 
 
 _TWIN_MISMATCHES = {

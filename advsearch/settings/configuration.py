@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import (
@@ -204,34 +204,41 @@ def settings(config: type[Config]) -> tuple[Setting, ...]:
     Attributes that a declaration leaves empty, such as the flag, are derived from the
     name, the type and the constraints of the field.
     """
-    completed = []
-    for field, info in config.model_fields.items():
-        if field in config.excluded_settings:
-            continue
-        extra: Any = info.json_schema_extra  # `setting` has stored it
-        declared: Setting = extra["declared"]
-        is_mapping = get_origin(info.annotation) is dict
-        default = None
-        if not info.is_required():
-            default = info.get_default(call_default_factory=True)
-        completed.append(
-            replace(
-                declared,
-                field=field,
-                name=info.alias or field,
-                required=info.is_required(),
-                default=default,
-                flag=declared.flag or "--" + field.replace("_", "-"),
-                expects=declared.expects or _describe_expected(info),
-                # the last word of the name
-                metavar=declared.metavar or field.rpartition("_")[2].upper(),
-                # each use of the flag adds an entry to a mapping
-                repeats=declared.repeats or is_mapping,
-                is_switch=info.annotation is bool,
-                is_mapping=is_mapping,
-            )
-        )
-    return tuple(completed)
+    return tuple(
+        _complete_declaration(field, info)
+        for field, info in config.model_fields.items()
+        if field not in config.excluded_settings
+    )
+
+
+def _complete_declaration(field: str, info: FieldInfo) -> Setting:
+    """Return the declaration of a setting with the attributes that were left empty.
+
+    Args:
+        field: name of the field.
+        info: pydantic's description of the field.
+    """
+    extra: Any = info.json_schema_extra  # `setting` has stored it
+    declared: Setting = extra["declared"]
+    is_mapping = get_origin(info.annotation) is dict
+    default = None
+    if not info.is_required():
+        default = info.get_default(call_default_factory=True)
+    return replace(
+        declared,
+        field=field,
+        name=info.alias or field,
+        required=info.is_required(),
+        default=default,
+        flag=declared.flag or "--" + field.replace("_", "-"),
+        expects=declared.expects or _describe_expected(info),
+        # the last word of the name
+        metavar=declared.metavar or field.rpartition("_")[2].upper(),
+        # each use of the flag adds an entry to a mapping
+        repeats=declared.repeats or is_mapping,
+        is_switch=info.annotation is bool,
+        is_mapping=is_mapping,
+    )
 
 
 def _describe_expected(info: FieldInfo) -> str:
@@ -253,6 +260,11 @@ def _describe_expected(info: FieldInfo) -> str:
     is_optional_literal = get_origin(types[0]) is Literal  # a Literal or None
     if is_optional_literal:
         return _join_choices(get_args(types[0]))
+    return _describe_range(info, is_integer=types == [int])
+
+
+def _describe_range(info: FieldInfo, *, is_integer: bool) -> str:
+    """Return the kind of number that a field takes, and its limits, as text."""
     # Constraints of pydantic: ge is "at least", gt is "greater than", le "at most".
     limits = {
         name: getattr(constraint, name)
@@ -260,7 +272,6 @@ def _describe_expected(info: FieldInfo) -> str:
         for name in ("ge", "gt", "le")
         if hasattr(constraint, name)
     }
-    is_integer = types == [int]
     number = "a whole number" if is_integer else "a number"
     if is_integer:
         upper = str(limits["le"])
@@ -399,13 +410,7 @@ class Config(BaseModel):
         A command does not have the settings in `excluded_settings`, although its class
         inherits them. `clashes` lists the settings that contradict others.
         """
-        for name in self.excluded_settings:
-            field = type(self).model_fields[name]
-            if getattr(self, name) != field.get_default(call_default_factory=True):
-                raise InputError(
-                    f"{name}: `advsearch {self.command}` has no such setting; leave it "
-                    "out"
-                )
+        self._check_excluded_settings()
         defaults = {setting.field: setting.default for setting in settings(type(self))}
         for clash in self.clashes:
             if clash.setting in self.excluded_settings:
@@ -415,6 +420,20 @@ class Config(BaseModel):
                 # The field of `set` is `set_`; messages have the name without "_".
                 raise InputError(f"{clash.setting.rstrip('_')}: {clash.why}")
         return self
+
+    def _check_excluded_settings(self) -> None:
+        """Check that settings that the command does not have are at their defaults.
+
+        Raises:
+            InputError: one is not.
+        """
+        for name in self.excluded_settings:
+            field = type(self).model_fields[name]
+            if getattr(self, name) != field.get_default(call_default_factory=True):
+                raise InputError(
+                    f"{name}: `advsearch {self.command}` has no such setting; leave it "
+                    "out"
+                )
 
     @classmethod
     def from_yaml(
@@ -445,20 +464,31 @@ class Config(BaseModel):
         for name, value in overrides.items():
             written.set_dotted(data, name, value)
         try:
-            # This first configuration only serves to find the settings with effects.
-            # Those that the user has requested by `overrides` remain.
-            omitted_settings = [
-                setting
-                for setting in cls(**data).settings_with_effects
-                if setting.name not in overrides
-            ]
-            for setting in omitted_settings:
-                # The file may use the name of the setting or of its field.
-                data.pop(setting.name, None)
-                data.pop(setting.field, None)
-            config = cls(**data)
+            return cls._without_effects(data, overrides)
         except SettingsError as error:
             raise SettingsError(error.problems, path) from None
+
+    @classmethod
+    def _without_effects(
+        cls, data: dict[str, object], overrides: Collection[str]
+    ) -> Self:
+        """Return the configuration without settings that affect more than the run.
+
+        Args:
+            data: values of the settings by name; ignored settings are removed.
+            overrides: names of settings that the user has requested, which remain.
+        """
+        # This first configuration only serves to find the settings with effects.
+        omitted_settings = [
+            setting
+            for setting in cls(**data).settings_with_effects
+            if setting.name not in overrides
+        ]
+        for setting in omitted_settings:
+            # The file may use the name of the setting or of its field.
+            data.pop(setting.name, None)
+            data.pop(setting.field, None)
+        config = cls(**data)
         config._omitted_settings = tuple(omitted_settings)
         return config
 
@@ -474,15 +504,8 @@ class Config(BaseModel):
             value = getattr(self, setting.field)
             effect = setting.power(value)
             if effect:
-                settings_with_effects.append(
-                    OmittedSetting(
-                        name=setting.name,
-                        field=setting.field,
-                        value=value,
-                        effect=effect,
-                        default=setting.default,
-                    )
-                )
+                omitted = _make_omitted_setting(setting, value, effect)
+                settings_with_effects.append(omitted)
         return tuple(settings_with_effects)
 
     @property
@@ -542,13 +565,8 @@ class Config(BaseModel):
             for base in cls.__mro__
             if issubclass(base, Config) and isinstance(other, base)
         )
-        excluded = (
-            *RUN_LOCATION,
-            "workers",
-            "cluster",
-            *cls.excluded_settings,
-            *other.excluded_settings,
-        )
+        excluded = {*RUN_LOCATION, "workers", "cluster"}
+        excluded |= {*cls.excluded_settings, *other.excluded_settings}
         return {
             name: getattr(other, name)
             for name in common_class.model_fields
@@ -696,6 +714,17 @@ def _check_shallow(config: type[Config], data: Mapping[str, Any]) -> None:
         raise _make_settings_error(config, problems)
 
 
+def _make_omitted_setting(setting: Setting, value: Any, effect: str) -> OmittedSetting:
+    """Return a setting with its value, and the effect of it outside of the run."""
+    return OmittedSetting(
+        name=setting.name,
+        field=setting.field,
+        value=value,
+        effect=effect,
+        default=setting.default,
+    )
+
+
 def _read_mappings(config: type[Config], data: Mapping[str, Any]) -> dict[str, Any]:
     """Convert texts of settings that are mappings, such as "pose.yaw=3", to mappings.
 
@@ -710,21 +739,35 @@ def _read_mappings(config: type[Config], data: Mapping[str, Any]) -> dict[str, A
             continue
         # pydantic accepts both names of a setting, such as "set" and "set_"
         for name in {setting.name, setting.field} & values.keys():
-            value = values[name]
-            texts = [value] if isinstance(value, str) else value
-            are_texts = isinstance(texts, (list, tuple)) and all(
-                isinstance(text, str) for text in texts
-            )
-            if not are_texts:
-                continue
-            try:
-                values[name] = setting.read_texts(texts, setting.name)
-            except ValueError:
-                got = texts[0] if len(texts) == 1 else texts
-                # the same form as the errors of pydantic, for the same message
-                problem = _make_problem(name, got)
-                raise _make_settings_error(config, [problem]) from None
+            values[name] = _read_mapping(config, setting, name, values[name])
     return values
+
+
+def _read_mapping(config: type[Config], setting: Setting, name: str, value: Any) -> Any:
+    """Convert a text, or a list of texts, to a mapping; return other values unchanged.
+
+    Args:
+        config: class with the settings.
+        setting: the setting.
+        name: its name, or that of its field.
+        value: its value.
+
+    Raises:
+        SettingsError: a text cannot be read.
+    """
+    texts = [value] if isinstance(value, str) else value
+    are_texts = isinstance(texts, (list, tuple)) and all(
+        isinstance(text, str) for text in texts
+    )
+    if not are_texts:
+        return value
+    try:
+        return setting.read_texts(texts, setting.name)
+    except ValueError:
+        got = texts[0] if len(texts) == 1 else texts
+        # the same form as the errors of pydantic, for the same message
+        problem = _make_problem(name, got)
+        raise _make_settings_error(config, [problem]) from None
 
 
 def _make_problem(name: str, value: Any) -> dict[str, Any]:
@@ -757,21 +800,25 @@ def _make_settings_error(config: type[Config], errors: Sequence[Any]) -> Advsear
     known |= {setting.field: setting for setting in declared}
     problems: dict[str, str] = {}
     for error in errors:
-        location = error["loc"]
-        name = str(location[0])
+        name = str(error["loc"][0])
         if name not in known:
             names = {setting.name for setting in declared}
             return UnknownNameError("setting", name, names)
         setting = known[name]
-        got = "nothing"
-        if error["type"] != "missing":
-            got = written.format_value(error["input"])
-        # whether one entry of a mapping is wrong, and not the full value
-        is_entry_wrong = setting.is_mapping and len(location) > 1
-        if is_entry_wrong:
-            got = f"{location[1]}={got}"
+        got = _describe_wrong_value(setting, error)
         problems.setdefault(setting.name, f"expected {setting.expects}, got {got}")
     return SettingsError(tuple(problems.items()))
+
+
+def _describe_wrong_value(setting: Setting, error: Any) -> str:
+    """Return the value that a setting has, by an error of pydantic, as text."""
+    got = "nothing"
+    if error["type"] != "missing":
+        got = written.format_value(error["input"])
+    # whether one entry of a mapping is wrong, and not the full value
+    location = error["loc"]
+    is_entry_wrong = setting.is_mapping and len(location) > 1
+    return f"{location[1]}={got}" if is_entry_wrong else got
 
 
 def _make_absolute(name: str) -> str:

@@ -52,11 +52,7 @@ def to_text(value: Any, *, several: bool = False) -> Any:
             names where one is expected.
     """
     items = value if isinstance(value, (list, tuple)) else [value]
-    are_names = all(
-        isinstance(item, (str, Path, int)) and not isinstance(item, bool)
-        for item in items
-    )
-    if not items or not are_names:
+    if not items or not all(map(_is_name_or_number, items)):
         return value
     if len(items) > 1 and not several:
         raise ValueError("several")
@@ -65,6 +61,11 @@ def to_text(value: Any, *, several: bool = False) -> Any:
     if has_no_name or "\0" in text:  # no name and no path contains a zero byte
         raise ValueError("an empty name")
     return text
+
+
+def _is_name_or_number(item: object) -> bool:
+    """Return whether a value is a name, a path or an integer."""
+    return isinstance(item, (str, Path, int)) and not isinstance(item, bool)
 
 
 def text_validator(*names: str, several: Sequence[str] = ()) -> Any:
@@ -204,24 +205,30 @@ def parse_controls(texts: Iterable[str], where: str) -> dict[str, object]:
     """
     controls: list[tuple[str, Any]] = []
     for text in texts:
-        for entry in _split_outside_brackets(text):
-            if not entry.strip():
-                continue
-            if "=" not in entry:
-                controls.append((entry.strip(), {}))
-                continue
-            name, settings = parse_assignment(entry, where)
-            # A value in braces that is not YAML remains a text.
-            if isinstance(settings, str) and settings.startswith("{"):
-                raise InputError(
-                    f"{where}: expected {{PARAMETER: VALUE or [LOW, HIGH], ...}} for "
-                    f"{name}, got {format_value(settings)}; write a colon and a space "
-                    "behind each parameter, close every bracket, and put a comma "
-                    "before the next control"
-                )
-            controls.append((name, settings))
+        entries = filter(str.strip, _split_outside_brackets(text))
+        controls += [_parse_control(entry, where) for entry in entries]
     check_no_duplicates((name for name, _ in controls), where)
     return dict(controls)
+
+
+def _parse_control(entry: str, where: str) -> tuple[str, Any]:
+    """Return the name and the settings of one control, ``NAME`` or ``NAME={...}``.
+
+    Raises:
+        InputError: braces do not contain a mapping; `where` names the setting.
+    """
+    if "=" not in entry:
+        return entry.strip(), {}
+    name, settings = parse_assignment(entry, where)
+    # A value in braces that is not YAML remains a text.
+    if isinstance(settings, str) and settings.startswith("{"):
+        raise InputError(
+            f"{where}: expected {{PARAMETER: VALUE or [LOW, HIGH], ...}} for "
+            f"{name}, got {format_value(settings)}; write a colon and a space "
+            "behind each parameter, close every bracket, and put a comma "
+            "before the next control"
+        )
+    return name, settings
 
 
 def _split_outside_brackets(text: str) -> list[str]:
@@ -309,22 +316,7 @@ def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, objec
     Raises:
         FileFormatError: the file is missing, not YAML, or not a mapping from names.
     """
-    data = parse_text(
-        path,
-        read_existing_text(path, "a YAML file", MAX_YAML_BYTES),
-        "YAML",
-        parse_yaml,
-    )
-    if not isinstance(data, dict) or not all(isinstance(name, str) for name in data):
-        got = "an empty file" if data is None else type(data).__name__
-        raise FileFormatError(
-            f"{path}: expected settings and values such as 'object: mug', got {got}"
-        )
-    if data.get("schema", SCHEMA) != SCHEMA:
-        got = format_value(data["schema"])
-        raise FileFormatError(
-            f"{path}: expected schema {SCHEMA}, got {got}; it is of another advsearch"
-        )
+    data = _read_settings_mapping(path)
     bases = _read_bases(path, data.pop("base", None), depth=len(above))
     resolved_path = Path(path).resolve()
     if bases and resolved_path in above:
@@ -336,6 +328,28 @@ def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, objec
         base_path = Path(path).parent / base
         result = merge_mappings(result, read_yaml(base_path, (*above, resolved_path)))
     return merge_mappings(result, data)
+
+
+def _read_settings_mapping(path: str | Path) -> dict[str, Any]:
+    """Read the mapping in a YAML file, and check its schema.
+
+    Raises:
+        FileFormatError: the file is missing, not YAML, not a mapping from names, or of
+            another version of advsearch.
+    """
+    text = read_existing_text(path, "a YAML file", MAX_YAML_BYTES)
+    data = parse_text(path, text, "YAML", parse_yaml)
+    if not isinstance(data, dict) or not all(isinstance(name, str) for name in data):
+        got = "an empty file" if data is None else type(data).__name__
+        raise FileFormatError(
+            f"{path}: expected settings and values such as 'object: mug', got {got}"
+        )
+    if data.get("schema", SCHEMA) != SCHEMA:
+        got = format_value(data["schema"])
+        raise FileFormatError(
+            f"{path}: expected schema {SCHEMA}, got {got}; it is of another advsearch"
+        )
+    return data
 
 
 def _read_bases(path: str | Path, value: Any, depth: int) -> list[str]:
@@ -397,17 +411,26 @@ def set_dotted(data: dict[str, object], name: str, value: object) -> None:
     if not rest:
         data[first] = value
         return
-    previous = data.get(first)
-    inner = dict[str, object]()
-    if isinstance(previous, str):
-        # NAME is short for {name: NAME}, and CONTROL for {CONTROL: null}
-        inner = {"name": previous} if first in NAME_SETTINGS else {previous: None}
-    elif isinstance(previous, list):
-        inner = {key: None for key in previous}
-    elif isinstance(previous, dict):
-        inner = dict(previous)
+    inner = _to_inner_mapping(first, data.get(first))
     if first in ("set", "grid"):  # the rest is the name of a parameter
         inner[rest] = value
     else:
         set_dotted(inner, rest, value)
     data[first] = inner
+
+
+def _to_inner_mapping(name: str, previous: object) -> dict[str, object]:
+    """Return the value of a name as a new mapping, to which an entry can be added.
+
+    Args:
+        name: name of a setting, or of a part of it.
+        previous: a text, a list or a mapping; any other value is dropped.
+    """
+    if isinstance(previous, str):
+        # NAME is short for {name: NAME}, and CONTROL for {CONTROL: null}
+        return {"name": previous} if name in NAME_SETTINGS else {previous: None}
+    if isinstance(previous, list):
+        return {key: None for key in previous}
+    if isinstance(previous, dict):
+        return dict(previous)
+    return {}

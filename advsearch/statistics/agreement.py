@@ -113,23 +113,42 @@ def correlation_interval(
     if n_units < MIN_UNITS:
         return None
     # the coefficient without the rows of one unit, for each unit
-    values_without_unit = np.array(
-        [
-            statistic(first[unit_index != unit], second[unit_index != unit])
-            for unit in range(n_units)
-        ]
-    )
+    values_without_unit = np.empty(n_units)
+    for unit in range(n_units):
+        is_other = unit_index != unit
+        values_without_unit[unit] = statistic(first[is_other], second[is_other])
     value = statistic(first, second)
     if not math.isfinite(value) or not np.isfinite(values_without_unit).all():
         return None
-    z = _to_fisher_z(values_without_unit)
-    # variance by the jackknife (Efron and Stein 1981)
-    variance = (n_units - 1) / n_units * float(((z - z.mean()) ** 2).sum())
-    probability = (1.0 + CONFIDENCE) / 2.0  # 0.975 lies below the upper bound
-    half_width = float(stdtrit(n_units - 1, probability)) * math.sqrt(variance)
+    return _compute_fisher_interval(value, values_without_unit)
+
+
+def _compute_fisher_interval(
+    value: float, values_without_unit: FloatArray
+) -> tuple[float, float]:
+    """Return the 95 % interval of a coefficient by the jackknife of Fisher's z.
+
+    Args:
+        value: the coefficient of all rows.
+        values_without_unit: (m,) the coefficient without the rows of each unit.
+    """
+    half_width = _compute_jackknife_half_width(_to_fisher_z(values_without_unit))
     center = float(_to_fisher_z(np.array(value)))
     # tanh turns Fisher's z into a coefficient again
     return math.tanh(center - half_width), math.tanh(center + half_width)
+
+
+def _compute_jackknife_half_width(z: npt.NDArray[np.float64]) -> float:
+    """Return half the width of the interval of a nearly normal value.
+
+    Args:
+        z: (m,) the value without each of m units.
+    """
+    n_units = len(z)
+    # variance by the jackknife (Efron and Stein 1981)
+    variance = (n_units - 1) / n_units * float(((z - z.mean()) ** 2).sum())
+    probability = (1.0 + CONFIDENCE) / 2.0  # 0.975 lies below the upper bound
+    return float(stdtrit(n_units - 1, probability)) * math.sqrt(variance)
 
 
 def _to_fisher_z(values: FloatArray) -> FloatArray:
@@ -170,15 +189,31 @@ def estimate_rate(
     n_units = len(np.unique(units))
     if n_units == n_rows:
         return rate, clopper_pearson(int(event.sum()), n_rows)
-    # The sums of residuals over units are independent, so their squares add up to the
-    # variance of the rate. m / (m - 1) corrects for the estimated mean of m units.
-    unit_residual = sum_per_unit(event - rate, units)
-    variance = float((unit_residual**2).sum()) / n_rows**2
-    variance *= n_units / max(n_units - 1, 1)
+    variance = _compute_rate_variance(event - rate, units)
     n_effective = float(n_units)
     if variance > 0.0 and n_units > 1:
         n_effective = _count_effective_rows(rate, variance, n_rows, n_units)
     return rate, _make_beta_interval(rate * n_effective, n_effective)
+
+
+def _compute_rate_variance(residuals: npt.ArrayLike, units: IntArray) -> float:
+    """Return the variance of a rate over rows that are grouped in units.
+
+    The sums of residuals over units are independent, so their squares add up to the
+    variance of the rate.
+
+    Args:
+        residuals: (n,) 1 minus the rate for rows in which the event happens, else 0
+            minus the rate.
+        units: (n,) unit of each row.
+    """
+    n_rows = len(units)
+    n_units = len(np.unique(units))
+    unit_residual = sum_per_unit(residuals, units)
+    variance = float((unit_residual**2).sum()) / n_rows**2
+    # m / (m - 1) corrects for the estimated mean of m units
+    variance *= n_units / max(n_units - 1, 1)
+    return variance
 
 
 def _count_effective_rows(

@@ -92,17 +92,30 @@ def rate_interval(
     """
     n_counted = np.asarray(counted, dtype=np.float64)
     n_rows = np.asarray(rows, dtype=np.float64)
+    _check_unit_counts(n_counted, n_rows)
+    are_rows_independent = n_rows.max() == 1.0
+    if are_rows_independent:
+        return clopper_pearson(round(n_counted.sum()), round(n_rows.sum()), confidence)
+    is_used = n_rows > 0.0
+    return _betting_interval(n_counted[is_used] / n_rows[is_used], confidence)
+
+
+def _check_unit_counts(n_counted: FloatArray, n_rows: FloatArray) -> None:
+    """Check the counts of units.
+
+    Args:
+        n_counted: number of rows of each unit in which an event happens.
+        n_rows: number of rows of each unit.
+
+    Raises:
+        InputError: a count is out of range, or no unit has rows.
+    """
     has_rows = n_counted.shape == n_rows.shape and n_rows.size and n_rows.max() > 0
     if not has_rows or (n_counted < 0).any() or (n_counted > n_rows).any():
         raise InputError(
             "share: expected counts from 0 to the predictions of each unit, and one "
             "prediction at least"
         )
-    are_rows_independent = n_rows.max() == 1.0
-    if are_rows_independent:
-        return clopper_pearson(round(n_counted.sum()), round(n_rows.sum()), confidence)
-    is_used = n_rows > 0.0
-    return _betting_interval(n_counted[is_used] / n_rows[is_used], confidence)
 
 
 def _betting_interval(samples: FloatArray, confidence: float) -> tuple[float, float]:
@@ -189,9 +202,7 @@ def compare_paired(
     if len(np.unique(units)) == n_rows:
         return _compare_independent_rows(first, second)
     unit_rows = sum_per_unit(np.ones(n_rows), units)
-    # The value of a row is 0 if only the first outcome happens, 1 if only the second
-    # does, and 1/2 otherwise. So it lies in [0, 1], as the bets need it.
-    advantage = (1.0 + second - 1.0 * first) / 2.0
+    advantage = _compute_advantage(first, second)
     unit_advantage = sum_per_unit(advantage, units) / unit_rows
     lower, upper = _betting_interval(unit_advantage, CONFIDENCE)
     # the mean advantage a in [0, 1] is a difference 2 a - 1 of rates
@@ -199,6 +210,19 @@ def compare_paired(
     second_rate = mean_rate(sum_per_unit(second, units), unit_rows)
     first_rate = mean_rate(sum_per_unit(first, units), unit_rows)
     return second_rate - first_rate, interval, _paired_p_value(unit_advantage)
+
+
+def _compute_advantage(first: Any, second: Any) -> FloatArray:
+    """Return the advantage of the second outcome in each row, in [0, 1] for bets.
+
+    It is 0 if only the first outcome happens, 1 if only the second does, and 1/2
+    otherwise.
+
+    Args:
+        first, second: (n,) bool, whether each outcome happens.
+    """
+    advantage: FloatArray = (1.0 + second - 1.0 * first) / 2.0
+    return advantage
 
 
 def _paired_p_value(unit_advantage: FloatArray) -> float:
@@ -287,17 +311,35 @@ def one_sided_p_value(
         return 1.0
     unit_rows = rows_inside + rows_outside
     if unit_rows.max() == 1.0:
-        return _fisher_p_value(
-            round(copies * float(right_inside.sum())),
-            round(copies * float(rows_inside.sum())),
-            round(copies * float(right_outside.sum())),
-            round(copies * float(rows_outside.sum())),
-        )
+        counts = (right_inside, rows_inside, right_outside, rows_outside)
+        totals = [round(copies * float(count.sum())) for count in counts]
+        return _fisher_p_value(*totals)
+    return _clustered_p_value(
+        right_inside, rows_inside, right_outside, rows_outside, copies
+    )
+
+
+def _clustered_p_value(
+    right_inside: npt.NDArray[np.float64],
+    rows_inside: npt.NDArray[np.float64],
+    right_outside: npt.NDArray[np.float64],
+    rows_outside: npt.NDArray[np.float64],
+    copies: float,
+) -> float:
+    """Return the p-value of `one_sided_p_value` if units have several predictions.
+
+    Args:
+        right_inside: (n,) right predictions of each unit inside.
+        rows_inside: (n,) predictions of each unit inside.
+        right_outside: (n,) right predictions of each unit outside.
+        rows_outside: (n,) predictions of each unit outside.
+        copies: number by which all units are multiplied.
+    """
     # By unit. A unit that has predictions on both sides is cut by the rule.
     has_inside = rows_inside > 0.0
     has_outside = rows_outside > 0.0
     is_cut = bool((has_inside & has_outside).any())
-    are_equally_large = len(np.unique(unit_rows)) == 1
+    are_equally_large = len(np.unique(rows_inside + rows_outside)) == 1
     if not is_cut and are_equally_large:
         return _permutation_p_value(
             right_inside + right_outside,
@@ -306,13 +348,34 @@ def one_sided_p_value(
             n_right_inside=copies * float(right_inside.sum()),
             times=copies,
         )
-    # The bets are on wrong predictions inside, and on right ones outside.
+    rates = _compute_bet_rates(right_inside, rows_inside, right_outside, rows_outside)
+    return _betting_p_value(rates, is_cut=is_cut, times=copies)
+
+
+def _compute_bet_rates(
+    right_inside: FloatArray,
+    rows_inside: FloatArray,
+    right_outside: FloatArray,
+    rows_outside: FloatArray,
+) -> FloatArray:
+    """Return the rates (n, 4) of units that `_betting_p_value` takes.
+
+    The bets are on wrong predictions inside, and on right ones outside.
+
+    Args:
+        right_inside: (n,) right predictions of each unit inside.
+        rows_inside: (n,) predictions of each unit inside.
+        right_outside: (n,) right predictions of each unit outside.
+        rows_outside: (n,) predictions of each unit outside.
+    """
     wrong_rate_inside = _divide_or_zero(rows_inside - right_inside, rows_inside)
     right_rate_outside = _divide_or_zero(right_outside, rows_outside)
+    has_inside = rows_inside > 0.0
+    has_outside = rows_outside > 0.0
     rates = np.stack(
         [wrong_rate_inside, has_inside, right_rate_outside, has_outside], axis=1
     )
-    return _betting_p_value(rates, is_cut=is_cut, times=copies)
+    return rates
 
 
 def _divide_or_zero(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
@@ -400,17 +463,31 @@ def _betting_p_value(rates: FloatArray, *, is_cut: bool, times: float) -> float:
     gains = _compute_gains(distinct_rates)
     stake_fraction = 0.5 if is_cut else 1.0
     gains = stake_fraction * gains
-    log_capitals = []  # (m,) for each stake
-    with np.errstate(divide="ignore"):  # the logarithm of a lost capital is -inf
-        for stake in STAKES:
-            log_factors = np.log(np.maximum(1.0 + stake * gains, 0.0))
-            # over all units, and `times` copies of each
-            log_capitals.append(times * (n_units[:, None] * log_factors).sum(axis=0))
+    log_capitals = _compute_log_capitals(gains, n_units, times)
     # (m,) the capital is the mean over stakes
     log_capital_of_rate = np.logaddexp.reduce(log_capitals, axis=0)
     log_capital_of_rate = log_capital_of_rate - np.log(len(STAKES))
     smallest_log_capital = log_capital_of_rate.min()
     return float(min(1.0, np.exp(-smallest_log_capital)))
+
+
+def _compute_log_capitals(
+    gains: FloatArray, n_units: npt.NDArray[np.intp], times: float
+) -> list[FloatArray]:
+    """Return the logarithm of the final capital (m,) of bets with each of `STAKES`.
+
+    Args:
+        gains: (k, m) gain of k kinds of units, for each of m null hypotheses.
+        n_units: (k,) number of units of each kind.
+        times: number of copies of each unit.
+    """
+    log_capitals = []
+    with np.errstate(divide="ignore"):  # the logarithm of a lost capital is -inf
+        for stake in STAKES:
+            log_factors = np.log(np.maximum(1.0 + stake * gains, 0.0))
+            # over all units, and `times` copies of each
+            log_capitals.append(times * (n_units[:, None] * log_factors).sum(axis=0))
+    return log_capitals
 
 
 def _compute_gains(rates: FloatArray) -> FloatArray:

@@ -31,6 +31,24 @@ def clopper_pearson(
     Raises:
         InputError: an argument is out of range.
     """
+    _check_binomial_counts(successes, trials, confidence)
+    tail = (1.0 - confidence) / 2.0
+    failures = trials - successes
+    low = 0.0
+    if successes:
+        low = float(betaincinv(successes, failures + 1, tail))
+    high = 1.0
+    if failures:
+        high = float(betaincinv(successes + 1, failures, 1.0 - tail))
+    return low, high
+
+
+def _check_binomial_counts(successes: int, trials: int, confidence: float) -> None:
+    """Check counts of trials and a confidence.
+
+    Raises:
+        InputError: one is out of range.
+    """
     if trials < 1:
         raise InputError(f"trials: expected at least 1, got {trials}")
     if not 0 <= successes <= trials:
@@ -41,15 +59,6 @@ def clopper_pearson(
         raise InputError(
             f"confidence: expected a number between 0 and 1, got {confidence}"
         )
-    tail = (1.0 - confidence) / 2.0
-    failures = trials - successes
-    low = 0.0
-    if successes:
-        low = float(betaincinv(successes, failures + 1, tail))
-    high = 1.0
-    if failures:
-        high = float(betaincinv(successes + 1, failures, 1.0 - tail))
-    return low, high
 
 
 def wilson_interval(rate: Any, n: Any) -> tuple[Any, Any]:

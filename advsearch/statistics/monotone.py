@@ -73,36 +73,88 @@ def find_dips(
     Returns:
         At most one dip for each distance, the nearest first.
     """
+    # the last distance has none beyond
+    dips = [
+        _find_dip(near, distances, right, counts) for near in range(len(distances) - 1)
+    ]
+    return tuple(dip for dip in dips if dip is not None)
+
+
+def _find_dip(
+    near: int,
+    distances: Sequence[float],
+    right: NDArray[np.int64],
+    counts: NDArray[np.int64],
+) -> Dip | None:
+    """Return the clearest dip at a distance; None if no range beyond has a higher rate.
+
+    Args:
+        near: index of the distance.
+        distances: m distances in ascending order.
+        right: (m,) number of images with a right prediction at each distance.
+        counts: (m,) number of images at each distance.
+    """
     n_distances = len(distances)
     n_comparisons = n_distances * (n_distances - 1) / 2.0
+    right_beyond = _sum_ranges_beyond(near, right)
+    counts_beyond = _sum_ranges_beyond(near, counts)
+    clearest = _find_clearest_dip(
+        right[near], counts[near], right_beyond, counts_beyond
+    )
+    if clearest is None:
+        return None
+    best, p_value = clearest
+    return Dip(
+        distance=float(distances[near]),
+        counts=(int(right[near]), int(counts[near])),
+        # last distance of the range: `best` counts from the one behind `near`
+        until=float(distances[near + 1 + best]),
+        counts_beyond=(int(right_beyond[best]), int(counts_beyond[best])),
+        p_value=min(1.0, p_value * n_comparisons),
+    )
+
+
+def _sum_ranges_beyond(near: int, values: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the sum of values over every range that begins right behind a distance.
+
+    Args:
+        near: index of the distance.
+        values: (m,) a value for each distance.
+
+    Returns:
+        (m - near - 1,) sums, by the end of the range, the nearest first.
+    """
     # sums over the distances before each index
-    right_before = np.concatenate([[0], np.cumsum(right)])
-    counts_before = np.concatenate([[0], np.cumsum(counts)])
-    dips = []
-    for near in range(n_distances - 1):
-        # Every range that begins right behind this distance, by its end: the index
-        # after its last distance.
-        end = np.arange(near + 2, n_distances + 1)
-        right_beyond = right_before[end] - right_before[near + 1]
-        counts_beyond = counts_before[end] - counts_before[near + 1]
-        p_values = _compute_p_values(
-            right[near], counts[near], right_beyond, counts_beyond
-        )
-        is_dip = right[near] / counts[near] < right_beyond / counts_beyond
-        if not is_dip.any():
-            continue
-        # the range with the clearest difference
-        best = int(np.argmin(np.where(is_dip, p_values, np.inf)))
-        dip = Dip(
-            distance=float(distances[near]),
-            counts=(int(right[near]), int(counts[near])),
-            # last distance of the range: `best` counts from the one behind `near`
-            until=float(distances[near + 1 + best]),
-            counts_beyond=(int(right_beyond[best]), int(counts_beyond[best])),
-            p_value=min(1.0, float(p_values[best]) * n_comparisons),
-        )
-        dips.append(dip)
-    return tuple(dips)
+    sums_before = np.concatenate([[0], np.cumsum(values)])
+    # the index after the last distance of each range
+    end = np.arange(near + 2, len(values) + 1)
+    sums_beyond: NDArray[np.int64] = sums_before[end] - sums_before[near + 1]
+    return sums_beyond
+
+
+def _find_clearest_dip(
+    right: np.int64,
+    count: np.int64,
+    right_beyond: NDArray[np.int64],
+    counts_beyond: NDArray[np.int64],
+) -> tuple[int, float] | None:
+    """Return the range beyond a distance with the clearest higher rate, and its p-value.
+
+    Args:
+        right: number of images with a right prediction at the distance.
+        count: number of images at the distance.
+        right_beyond: (k,) number of images with a right prediction in each range.
+        counts_beyond: (k,) number of images in each range.
+
+    Returns:
+        The index of the range, and its p-value; None if no range has a higher rate.
+    """
+    p_values = _compute_p_values(right, count, right_beyond, counts_beyond)
+    is_dip = right / count < right_beyond / counts_beyond
+    if not is_dip.any():
+        return None
+    best = int(np.argmin(np.where(is_dip, p_values, np.inf)))
+    return best, float(p_values[best])
 
 
 def _compute_p_values(

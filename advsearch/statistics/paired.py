@@ -36,25 +36,31 @@ def paired_difference(
     second_low, second_high = map(float, wilson_interval(second_rate, n))
     first_low, first_high = map(float, wilson_interval(first_rate, n))
     correlation = _phi_coefficient(both, first, second, neither)
-
-    def combine(second_distance: float, first_distance: float) -> float:
-        """Return the distance from the difference to one of its bounds.
-
-        The arguments are the distances from both rates to their bounds. They add up as
-        standard deviations of correlated variables do.
-        """
-        squared = (
-            second_distance * second_distance
-            - 2 * correlation * second_distance * first_distance
-            + first_distance * first_distance
-        )
-        return math.sqrt(max(0.0, squared))  # not below 0 by rounding
-
     difference = second_rate - first_rate
     # the difference is smallest where the second rate is low and the first high
-    below = combine(second_rate - second_low, first_high - first_rate)
-    above = combine(second_high - second_rate, first_rate - first_low)
+    below = _combine_distances(
+        second_rate - second_low, first_high - first_rate, correlation
+    )
+    above = _combine_distances(
+        second_high - second_rate, first_rate - first_low, correlation
+    )
     return difference, (max(-1.0, difference - below), min(1.0, difference + above))
+
+
+def _combine_distances(
+    second_distance: float, first_distance: float, correlation: float
+) -> float:
+    """Return the distance from a difference of rates to one of its bounds.
+
+    The distances from both rates to their bounds add up as standard deviations of
+    correlated variables do.
+    """
+    squared = (
+        second_distance * second_distance
+        - 2 * correlation * second_distance * first_distance
+        + first_distance * first_distance
+    )
+    return math.sqrt(max(0.0, squared))  # not below 0 by rounding
 
 
 def _phi_coefficient(both: int, first: int, second: int, neither: int) -> float:

@@ -20,7 +20,7 @@ import pickle
 import re
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -66,17 +66,7 @@ class Archive:
             FileFormatError: there is no member of that name, it is larger than `limit`
                 bytes (before `scale_limit`), or it is corrupt.
         """
-        if name not in self.members:
-            raise make_archive_error(
-                self.path, f"has no {name!r}, so it is not complete"
-            )
-        size = self.members[name].file_size
-        if size > scale_limit(limit):
-            raise make_size_error(
-                self.path,
-                f"{name!r} of at most {scale_limit(limit):,} bytes in it",
-                f"{size:,}",
-            )
+        self._check_member(name, limit)
         try:
             return self.zip.read(self.members[name])
         except (
@@ -88,6 +78,24 @@ class Archive:
             NotImplementedError,
         ) as error:
             raise make_truncation_error(self.path, error) from None
+
+    def _check_member(self, name: str, limit: int) -> None:
+        """Check that there is a member of at most `limit` bytes, before `scale_limit`.
+
+        Raises:
+            FileFormatError: it is missing, or larger.
+        """
+        if name not in self.members:
+            raise make_archive_error(
+                self.path, f"has no {name!r}, so it is not complete"
+            )
+        size = self.members[name].file_size
+        if size > scale_limit(limit):
+            raise make_size_error(
+                self.path,
+                f"{name!r} of at most {scale_limit(limit):,} bytes in it",
+                f"{size:,}",
+            )
 
     def read_json(self, name: str) -> Any:
         """Return the value of a member that holds JSON.
@@ -121,8 +129,23 @@ def open_archive(path: Path, file: BinaryIO, size: int) -> Archive:
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
         raise make_truncation_error(path, error) from None
     _check_unpacked_size(path, sum(entry.file_size for entry in entries), size)
-    # torch puts all members into one folder of an arbitrary name. It is left out of the
-    # names, so that "resnet/data.pkl" becomes "data.pkl".
+    members = _name_members(path, entries)
+    for name, entry in members.items():
+        _check_member_form(path, name, entry)
+    return Archive(path, archive, members)
+
+
+def _name_members(
+    path: Path, entries: Sequence[zipfile.ZipInfo]
+) -> dict[str, zipfile.ZipInfo]:
+    """Return the members of an archive by name, without the root folder.
+
+    torch puts all members into one folder of an arbitrary name. It is left out of the
+    names, so that "resnet/data.pkl" becomes "data.pkl".
+
+    Raises:
+        FileFormatError: two members have one name.
+    """
     roots = {
         entry.filename.partition("/")[0] if "/" in entry.filename else ""
         for entry in entries
@@ -131,15 +154,22 @@ def open_archive(path: Path, file: BinaryIO, size: int) -> Archive:
     members = {entry.filename.removeprefix(root): entry for entry in entries}
     if len(members) < len(entries):
         raise make_archive_error(path, "has two members of one name")
-    for name, entry in members.items():
-        if not _NAME.fullmatch(name) or ".." in name.split("/"):
-            raise make_archive_error(path, f"has a member of the name {name[:80]!r}")
-        is_encrypted = entry.flag_bits & 0x1
-        if is_encrypted or entry.compress_type not in _METHODS:
-            raise make_archive_error(
-                path, f"has an encrypted or strangely packed member, {name[:80]!r}"
-            )
-    return Archive(path, archive, members)
+    return members
+
+
+def _check_member_form(path: Path, name: str, entry: zipfile.ZipInfo) -> None:
+    """Check that a member has a name and a packing that torch's archives have.
+
+    Raises:
+        FileFormatError: it has others.
+    """
+    if not _NAME.fullmatch(name) or ".." in name.split("/"):
+        raise make_archive_error(path, f"has a member of the name {name[:80]!r}")
+    is_encrypted = entry.flag_bits & 0x1
+    if is_encrypted or entry.compress_type not in _METHODS:
+        raise make_archive_error(
+            path, f"has an encrypted or strangely packed member, {name[:80]!r}"
+        )
 
 
 def _check_unpacked_size(path: Path, unpacked: int, size: int) -> None:
@@ -239,18 +269,32 @@ def rewrite_torchscript(archive: Archive) -> tuple[io.BytesIO, bool]:
     tensors = [
         name for name in archive.members if name.partition("/")[0] in tensor_folders
     ]
+    buffer = _write_torchscript(archive, code, [*pickles, *tensors])
+    # torch calls the method __setstate__ of a module while it loads it.
+    runs_code = any(b"__setstate__" in content for content in code.values())
+    return buffer, runs_code
+
+
+def _write_torchscript(
+    archive: Archive, code: Mapping[str, bytes], names: Sequence[str]
+) -> io.BytesIO:
+    """Return a new archive with some members of another one.
+
+    Args:
+        archive: archive to copy from.
+        code: source code by member, which is written first.
+        names: names of the other members.
+    """
     version = _read_version(archive)
     buffer = io.BytesIO()
     writer = torch._C.PyTorchFileWriter(buffer)
     writer.set_min_version(version)
-    for name in (*code, *pickles, *tensors):
+    for name in (*code, *names):
         content = code[name] if name in code else archive.read_member(name)
         writer.write_record(name, content, len(content))
     writer.write_end_of_file()
     buffer.seek(0)
-    # torch calls the method __setstate__ of a module while it loads it.
-    runs_code = any(b"__setstate__" in content for content in code.values())
-    return buffer, runs_code
+    return buffer
 
 
 def _read_code(archive: Archive) -> dict[str, bytes]:
@@ -266,16 +310,30 @@ def _read_code(archive: Archive) -> dict[str, bytes]:
         if name.startswith("code/") and name.endswith(".py")
     ]
     code = {name: archive.read_member(name, LARGEST_CODE) for name in scripts}
+    _check_code(archive.path, code)
+    return code
+
+
+def _check_code(path: Path, code: Mapping[str, bytes]) -> None:
+    """Check the source code of a TorchScript archive.
+
+    Args:
+        path: path of the archive, for errors.
+        code: content of the members with source code, by name.
+
+    Raises:
+        FileFormatError: there is too much code, or it calls functions that a network
+            does not need.
+    """
     if sum(map(len, code.values())) > LARGEST_CODE:
         raise make_archive_error(
-            archive.path, f"has more than {LARGEST_CODE:,} bytes of source code"
+            path, f"has more than {LARGEST_CODE:,} bytes of source code"
         )
     for name, content in code.items():
         if wrong := _find_code_problem(content):
             raise make_archive_error(
-                archive.path, f"{name!r} {wrong}, which no plain network does"
+                path, f"{name!r} {wrong}, which no plain network does"
             )
-    return code
 
 
 def _read_version(archive: Archive) -> int:
@@ -309,12 +367,16 @@ def _find_code_problem(content: bytes) -> str:
     families = _NATIVE_CLASS.findall(text)
     if not _HARMLESS_FAMILIES.issuperset(families):
         return "uses native classes other than those of quantized networks"
-    has_control_character = any(
-        ord(char) < 32 and ord(char) not in _WHITE_SPACE_CODES for char in text
-    )
-    if has_control_character or any(map(_hides_character, _ESCAPE.findall(text))):
+    if _has_control_character(text) or any(
+        map(_hides_character, _ESCAPE.findall(text))
+    ):
         return "has text with hidden characters"
     return ""
+
+
+def _has_control_character(text: str) -> bool:
+    """Return whether a text has a control character other than white space."""
+    return any(ord(char) < 32 and ord(char) not in _WHITE_SPACE_CODES for char in text)
 
 
 def _hides_character(escape: str) -> bool:
@@ -405,13 +467,7 @@ def _check_pickle(archive: Archive, name: str) -> None:
         raise make_archive_error(
             archive.path, f"{name!r} is damaged ({get_first_line(error)})"
         ) from None
-    # Only some families of native classes of torch, such as those of quantized
-    # networks, are harmless.
-    if any(
-        family not in _HARMLESS_FAMILIES
-        for text in reader.names
-        for family in _NATIVE_CLASS.findall(text)
-    ):
+    if any(map(_names_native_object, reader.names)):
         raise make_archive_error(
             archive.path, f"{name!r} holds native objects, which are never loaded"
         )
@@ -419,6 +475,16 @@ def _check_pickle(archive: Archive, name: str) -> None:
     tensor_folder = FOLDER_OF_PICKLE[name]
     for storage in reader.storages:
         _check_storage(archive, tensor_folder, storage)
+
+
+def _names_native_object(text: str) -> bool:
+    """Return whether a text names a native class of torch that may do harm.
+
+    Only some families of native classes, such as those of quantized networks, are
+    harmless.
+    """
+    families = _NATIVE_CLASS.findall(text)
+    return any(family not in _HARMLESS_FAMILIES for family in families)
 
 
 def _check_storage(archive: Archive, folder: str, storage: Any) -> None:
@@ -471,25 +537,31 @@ def _check_values(archive: Archive, name: str, value: Any) -> None:
     # All objects belong to `value`, so that none is freed and no id is used twice.
     checked_ids = {id(value)}
     for _ in range(DEPTH):
-        characters = {char for item in level if isinstance(item, str) for char in item}
-        has_hidden_character = any(
-            ord(char) not in _WHITE_SPACE_CODES and not char.isprintable()
-            for char in characters
-        )
-        if has_hidden_character:
+        if _has_hidden_character(level):
             raise make_archive_error(
                 archive.path, f"{name!r} has text with hidden characters"
             )
-        new_by_id = dict[int, Any]()
-        for outer in level:
-            for inner in _list_inner_values(outer):
-                if id(inner) not in checked_ids:
-                    new_by_id[id(inner)] = inner
+        inner_values = chain.from_iterable(map(_list_inner_values, level))
+        new_by_id = {
+            id(inner): inner for inner in inner_values if id(inner) not in checked_ids
+        }
         level = list(new_by_id.values())
         checked_ids.update(new_by_id)
         if not level:
             return
     raise make_archive_error(archive.path, f"{name!r} is nested deeper than {DEPTH}")
+
+
+def _has_hidden_character(values: Iterable[object]) -> bool:
+    """Return whether a text among values has a character that is not printed."""
+    characters = set[str]()
+    for value in values:
+        if isinstance(value, str):
+            characters.update(value)
+    return any(
+        ord(char) not in _WHITE_SPACE_CODES and not char.isprintable()
+        for char in characters
+    )
 
 
 def _list_inner_values(value: Any) -> Iterable[Any]:

@@ -168,11 +168,7 @@ def connect_to_read(path: Path) -> sqlite3.Connection:
     Raises:
         FileFormatError: there is no such file.
     """
-    if not os.path.isfile(path):
-        raise FileFormatError(
-            f"{path}: expected the results of a run, got no such file; check the name "
-            "of the run"
-        )
+    _check_database_exists(path)
     address = path.resolve().as_uri()
     db = sqlite3.connect(f"{address}?mode=ro", uri=True)
     try:
@@ -183,6 +179,19 @@ def connect_to_read(path: Path) -> sqlite3.Connection:
         db = sqlite3.connect(f"{address}?immutable=1", uri=True)
     set_defensive_options(db)
     return db
+
+
+def _check_database_exists(path: Path) -> None:
+    """Check that there is a file with the results of a run.
+
+    Raises:
+        FileFormatError: there is none.
+    """
+    if not os.path.isfile(path):
+        raise FileFormatError(
+            f"{path}: expected the results of a run, got no such file; check the name "
+            "of the run"
+        )
 
 
 def read_version(db: sqlite3.Connection) -> int:

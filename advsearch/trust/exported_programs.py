@@ -20,10 +20,11 @@ import keyword
 import math
 import pickletools
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from advsearch.errors import FileFormatError
 from advsearch.files import JsonObject, JsonValue
 from advsearch.trust.archives import (
     LARGEST_TEXT,
@@ -91,17 +92,20 @@ def find_expression_problem(text: object) -> str:
         tree = ast.parse(text.strip(), mode="eval")
         _check(tree.body, DEPTH, EXPONENT)
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-        reason = "it cannot be read"
-        # `_check` raises a plain ValueError, whose message is for the user. Its
-        # subclasses, such as UnicodeError, and the other errors come from Python's
-        # parser.
-        if type(error) is ValueError:
-            reason = str(error.args[0])
         return (
             "expected arithmetic with whole numbers and symbols, got "
-            f"{text[:60]!r} ({reason})"
+            f"{text[:60]!r} ({_get_refusal_reason(error)})"
         )
     return ""
+
+
+def _get_refusal_reason(error: Exception) -> str:
+    """Return why an expression is refused, from the error of reading or checking it."""
+    # `_check` raises a plain ValueError, whose message is for the user. Its subclasses,
+    # such as UnicodeError, and the other errors come from Python's parser.
+    if type(error) is ValueError:
+        return str(error.args[0])
+    return "it cannot be read"
 
 
 def _check(node: ast.expr, depth: int, max_power: int) -> None:
@@ -259,11 +263,9 @@ def _divide_max_power(exponent: ast.expr, max_power: int) -> int:
     match exponent:
         case ast.Call(func=ast.Name(id="Integer"), args=[number]):
             exponent = _without_sign(number)
-    if isinstance(exponent, ast.Call) and ast.unparse(exponent) in (
-        "Rational(1, 2)",
-        "Rational(-1, 2)",
-    ):
-        return max_power
+    is_call = isinstance(exponent, ast.Call)
+    if is_call and ast.unparse(exponent) in ("Rational(1, 2)", "Rational(-1, 2)"):
+        return max_power  # a root
     value = _get_constant(exponent)
     if not isinstance(value, int) or isinstance(value, bool) or value > max_power:
         raise ValueError("an exponent that is not a small number")
@@ -375,20 +377,33 @@ def rewrite_program(archive: Archive) -> io.BytesIO:
         # torch requires this member (example inputs), but does not need its content
         writer.write_bytes(EXAMPLE[0], b"")
         for kind in ("weights", "constants"):
-            folder = f"data/{kind}/"
-            # An archive has either one pickle of all tensors, or a table with a file
-            # for each tensor.
-            pickle_name = names[f"{folder}model.pt"]
-            if pickle_name in archive:
-                _check_pickle(archive, pickle_name)
-                writer.write_bytes(
-                    f"{folder}model.pt", archive.read_member(pickle_name)
-                )
-            else:
-                config = f"{folder}model_{kind}_config.json"
-                _copy_tensors(archive, writer, folder, config)
+            _copy_all_tensors(archive, writer, kind, names)
     buffer.seek(0)
     return buffer
+
+
+def _copy_all_tensors(
+    archive: Archive, writer: Any, kind: str, names: Mapping[str, str]
+) -> None:
+    """Copy all tensors of a kind from an archive to a new one.
+
+    An archive has either one pickle of all tensors, or a table with a file for each
+    tensor.
+
+    Args:
+        archive: archive to read.
+        writer: writer of the new archive.
+        kind: "weights" or "constants".
+        names: the names of members in the archive, by their present names.
+    """
+    folder = f"data/{kind}/"
+    pickle_name = names[f"{folder}model.pt"]
+    if pickle_name in archive:
+        _check_pickle(archive, pickle_name)
+        writer.write_bytes(f"{folder}model.pt", archive.read_member(pickle_name))
+    else:
+        config = f"{folder}model_{kind}_config.json"
+        _copy_tensors(archive, writer, folder, config)
 
 
 def _read_program(archive: Archive, name: str) -> Any:
@@ -426,6 +441,24 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
     Raises:
         FileFormatError: the table or one of its entries has another form.
     """
+    table = _read_tensor_table(archive, config)
+    copied: set[str] = set()  # multiple tensors may share a file of numbers
+    for name, entry in table.items():
+        # If this member is missing, `read_member` raises an error below.
+        member = f"{folder}{_get_record(archive, name, entry)}"
+        _check_not_empty(archive, member, entry)
+        if member not in copied:
+            writer.write_bytes(member, archive.read_member(member))
+            copied.add(member)
+    writer.write_bytes(config, json.dumps({"config": table}).encode())
+
+
+def _read_tensor_table(archive: Archive, config: str) -> Any:
+    """Return the entry of each tensor by its name, from the member `config`.
+
+    Raises:
+        FileFormatError: the table has another form, or a name is not plain.
+    """
     content = archive.read_json(config)
     table = content.get("config") if isinstance(content, dict) else None
     if not isinstance(table, dict) or not all(
@@ -436,27 +469,33 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
             f"expected a table of tensors in {config!r}, got something else",
         )
     # Names of tensors are the keys of the table: they have to be plain names.
-    table = _check_value(archive.path, table, "tensor_name")
-    copied: set[str] = set()  # multiple tensors may share a file of numbers
-    for name, entry in table.items():
-        # If this member is missing, `read_member` raises an error below.
-        member = f"{folder}{_get_record(archive, name, entry)}"
-        shape = _read_shape(archive, member, entry)
-        # For an empty file torch would allocate a tensor of any size that the table
-        # states, which could exhaust the memory.
-        if (
-            member in archive
-            and archive.members[member].file_size == 0
-            and math.prod(shape) > 0
-        ):
-            raise make_archive_error(
-                archive.path,
-                f"{member[:80]!r} is empty, but should hold a tensor of {shape[:8]}",
-            )
-        if member not in copied:
-            writer.write_bytes(member, archive.read_member(member))
-            copied.add(member)
-    writer.write_bytes(config, json.dumps({"config": table}).encode())
+    return _check_value(archive.path, table, "tensor_name")
+
+
+def _check_not_empty(archive: Archive, member: str, entry: Any) -> None:
+    """Check that the file of a tensor has numbers if the tensor has.
+
+    For an empty file torch would allocate a tensor of any size that the table states,
+    which could exhaust the memory.
+
+    Args:
+        archive: archive to read.
+        member: name of the file.
+        entry: entry of the tensor in the table.
+
+    Raises:
+        FileFormatError: the file is empty, or the entry has another form.
+    """
+    shape = _read_shape(archive, member, entry)
+    if (
+        member in archive
+        and archive.members[member].file_size == 0
+        and math.prod(shape) > 0
+    ):
+        raise make_archive_error(
+            archive.path,
+            f"{member[:80]!r} is empty, but should hold a tensor of {shape[:8]}",
+        )
 
 
 def _get_record(archive: Archive, name: str, entry: Any) -> str:
@@ -533,22 +572,45 @@ def _check_value(path: Path, value: JsonValue, key: str) -> Any:
         if problem:
             raise make_archive_error(path, problem)
         return value
-    checked: JsonObject = {}
-    for name, inner in value.items():
-        if name in _EMPTIED_ENTRIES:
-            # The value is not used, so that it needs no check.
-            checked[name] = _EMPTIED_ENTRIES[name]
-            continue
-        problem = _find_problem(name, key) if name else ""  # the empty key is allowed
-        is_custom_object = name in ("as_custom_obj", "custom_obj")
-        # torch always writes this table, which is empty for a plain network.
-        has_custom_objects = name == "custom_obj_values" and bool(inner)
-        if is_custom_object or has_custom_objects:
-            problem = "holds a custom object, which is never loaded"
-        if problem:
-            raise make_archive_error(path, problem)
-        checked[name] = _check_value(path, inner, name)
-    return checked
+    return {name: _check_entry(path, name, inner, key) for name, inner in value.items()}
+
+
+def _check_entry(path: Path, name: str, value: JsonValue, key: str) -> Any:
+    """Check an entry of a mapping, and return its value as `_check_value` does.
+
+    Args:
+        path: path of the archive, for errors.
+        name: name of the entry.
+        value: value of the entry.
+        key: name of the entry that holds the mapping.
+
+    Raises:
+        FileFormatError: the entry cannot be part of a plain network.
+    """
+    if name in _EMPTIED_ENTRIES:
+        # The value is not used, so that it needs no check.
+        return _EMPTIED_ENTRIES[name]
+    problem = _find_entry_problem(name, value, key)
+    if problem:
+        raise make_archive_error(path, problem)
+    return _check_value(path, value, name)
+
+
+def _find_entry_problem(name: str, value: JsonValue, key: str) -> str:
+    """Return what is wrong with an entry of a mapping; "" for nothing.
+
+    Args:
+        name: name of the entry.
+        value: its value, of which only custom objects are checked.
+        key: name of the entry that holds the mapping.
+    """
+    problem = _find_problem(name, key) if name else ""  # the empty key is allowed
+    is_custom_object = name in ("as_custom_obj", "custom_obj")
+    # torch always writes this table, which is empty for a plain network.
+    has_custom_objects = name == "custom_obj_values" and bool(value)
+    if is_custom_object or has_custom_objects:
+        return "holds a custom object, which is never loaded"
+    return problem
 
 
 def _find_problem(value: Any, key: str) -> str:
@@ -707,17 +769,35 @@ def _check_pickle(archive: Archive, name: str) -> None:
         f"cannot be read as torch.export ({name!r} would have to be unpickled, which "
         "is never done)",
     )
+    steps = _read_pickle_steps(archive.path, data, refusal)
+    if any(_imports_other(step.name, argument) for step, argument, _position in steps):
+        raise refusal
+
+
+def _read_pickle_steps(path: Path, data: bytes, refusal: FileFormatError) -> list[Any]:
+    """Return the steps of the pickle in a file of `torch.save`, as `pickletools` does.
+
+    Args:
+        path: path of the archive that contains the file, for errors.
+        data: content of the file, itself an archive.
+        refusal: error to raise if it is another file.
+
+    Raises:
+        FileFormatError: it is.
+    """
     is_zip = data[:2] == b"PK"
     if not is_zip:
         raise refusal
-    inner = open_archive(archive.path, io.BytesIO(data), len(data))
+    inner = open_archive(path, io.BytesIO(data), len(data))
     if "data.pkl" not in inner:
         raise refusal
     try:
-        steps = list(pickletools.genops(inner.read_member("data.pkl", LARGEST_TEXT)))
+        return list(pickletools.genops(inner.read_member("data.pkl", LARGEST_TEXT)))
     except (ValueError, IndexError, UnicodeDecodeError):
         raise refusal from None
-    for step, argument, _position in steps:
-        imports_other = step.name == "GLOBAL" and not _GLOBALS.fullmatch(str(argument))
-        if imports_other or step.name in _OTHER_IMPORTS:
-            raise refusal
+
+
+def _imports_other(step_name: str, argument: Any) -> bool:
+    """Return whether a step of a pickle imports anything but the classes of tensors."""
+    is_other_class = step_name == "GLOBAL" and not _GLOBALS.fullmatch(str(argument))
+    return is_other_class or step_name in _OTHER_IMPORTS

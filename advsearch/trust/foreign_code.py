@@ -72,17 +72,10 @@ def run_within_limits(
     outcome: Future[Result] = Future()
     # Torch has this switch for each thread, so it is copied to the new one.
     records_gradients = torch.is_grad_enabled()
-
-    def work() -> None:
-        """Call the code, and store its result or its error."""
-        try:
-            with torch.set_grad_enabled(records_gradients):
-                outcome.set_result(call())
-        except BaseException as error:
-            outcome.set_exception(error)
-
     # A daemon, so that the process does not wait for the thread at its end.
-    thread = threading.Thread(target=work, daemon=True)
+    thread = threading.Thread(
+        target=_call_to_outcome, args=(call, outcome, records_gradients), daemon=True
+    )
     thread.start()
     thread.join(scale_limit(LONGEST))
     if thread.is_alive():
@@ -92,6 +85,23 @@ def run_within_limits(
             thread.join(GRACE)
         raise ForeignCodeTimeoutError
     return outcome.result()
+
+
+def _call_to_outcome(
+    call: Callable[[], Result], outcome: Future[Result], records_gradients: bool
+) -> None:
+    """Call foreign code, and store its result or its error.
+
+    Args:
+        call: function to call.
+        outcome: gets the result.
+        records_gradients: whether torch records gradients meanwhile.
+    """
+    try:
+        with torch.set_grad_enabled(records_gradients):
+            outcome.set_result(call())
+    except BaseException as error:
+        outcome.set_exception(error)
 
 
 def try_torchscript(archive: io.BytesIO) -> str:
@@ -178,10 +188,7 @@ def use_default_torch_state() -> Iterator[None]:
     computations depend neither on the caller's switches nor on those that foreign code
     sets.
     """
-    leaves_inference_mode: AbstractContextManager[Any] = nullcontext()
-    if torch.is_inference_mode_enabled():
-        leaves_inference_mode = torch.inference_mode(False)
-    with leaves_inference_mode:
+    with _suspend_inference_mode():
         before = TorchState.read_current()
         # `find_expected_torch_state` reads the switches from before the outermost block.
         _outside.append(before)
@@ -193,6 +200,13 @@ def use_default_torch_state() -> Iterator[None]:
             _outside.pop()
             if TorchState.read_current() != before:
                 before.apply()
+
+
+def _suspend_inference_mode() -> AbstractContextManager[Any]:
+    """Return a context in which `torch.inference_mode` is off."""
+    if torch.is_inference_mode_enabled():
+        return torch.inference_mode(False)
+    return nullcontext()
 
 
 def find_expected_torch_state() -> TorchState:

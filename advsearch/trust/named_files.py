@@ -119,15 +119,7 @@ class ReferencedFiles:
             raise FileFormatError(OUTSIDE if os.path.lexists(path) else MISSING)
         if path not in self._contents:
             try:
-                data = stored_files.read_bytes(
-                    Path(path), "an ordinary file", LARGEST_FILE
-                )
-                check_most(
-                    path,
-                    self._size + len(data),
-                    LARGEST_FILE,
-                    "files of at most {} bytes in all",
-                )
+                data = self._read_within_limit(path)
             except FileFormatError as error:
                 # the message becomes a clause about the name, without the path
                 text = str(error).removeprefix(f"{path}: ")
@@ -135,3 +127,15 @@ class ReferencedFiles:
             self._contents[path] = data
             self._size += len(data)
         return self._contents[path]
+
+    def _read_within_limit(self, path: str) -> bytes:
+        """Return the bytes of a file.
+
+        Raises:
+            FileFormatError: it is missing, no ordinary file, or too large, alone or
+                together with those that were read before.
+        """
+        data = stored_files.read_bytes(Path(path), "an ordinary file", LARGEST_FILE)
+        total = self._size + len(data)
+        check_most(path, total, LARGEST_FILE, "files of at most {} bytes in all")
+        return data

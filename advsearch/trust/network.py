@@ -43,15 +43,8 @@ def check_address(spec: str) -> SplitResult:
         InputError: it has no host; it contains a secret, which would be stored with the
             run; or the key from the environment would be sent there unencrypted.
     """
-    try:
-        address = urlsplit(spec)
-        host = address.hostname
-        # Only for the check: an invalid port raises ValueError.
-        _ = address.port
-    except ValueError as error:
-        raise InputError(
-            f"model {spec!r}: expected an address, http://HOST:PORT/PATH ({error})"
-        ) from None
+    address = _parse_address(spec)
+    host = address.hostname
     is_plain = spec.isascii() and spec.isprintable() and " " not in spec
     if not host or not is_plain:
         raise InputError(f"model {spec!r}: expected an address, http://HOST:PORT/PATH")
@@ -61,6 +54,23 @@ def check_address(spec: str) -> SplitResult:
             f"model {spec}: the key in {KEY} would go there unencrypted; "
             f"use https, or unset {KEY}"
         )
+    return address
+
+
+def _parse_address(spec: str) -> SplitResult:
+    """Return the parts of a model's address, of which the host and the port are valid.
+
+    Raises:
+        InputError: it is no address.
+    """
+    try:
+        address = urlsplit(spec)
+        # Only for the check: an invalid host or port raises ValueError.
+        _ = address.hostname, address.port
+    except ValueError as error:
+        raise InputError(
+            f"model {spec!r}: expected an address, http://HOST:PORT/PATH ({error})"
+        ) from None
     return address
 
 
@@ -157,18 +167,7 @@ def _write_certificate(hosts: Sequence[str], key: Path, certificate: Path) -> No
     Raises:
         InputError: there is no such program, or it fails.
     """
-    names = ",".join(
-        f"IP:{host}" if is_address(host) else f"DNS:{host}"
-        for host in dict.fromkeys(hosts)
-    )
-    command = [
-        *("openssl", "req", "-x509"),
-        *("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes"),
-        *("-keyout", str(key), "-out", str(certificate)),
-        *("-days", str(DAYS), "-subj", "/CN=advsearch"),
-        *("-addext", f"subjectAltName={names}"),
-        *("-addext", "extendedKeyUsage=serverAuth"),
-    ]
+    command = _make_openssl_command(hosts, key, certificate)
     try:
         subprocess.run(
             command,
@@ -183,11 +182,32 @@ def _write_certificate(hosts: Sequence[str], key: Path, certificate: Path) -> No
             "install openssl, or leave `host` and `https` out"
         ) from None
     except (OSError, subprocess.SubprocessError) as error:
-        output: bytes = getattr(error, "stderr", None) or b""
-        text = output.decode(errors="replace")[-300:]  # the end has the reason
-        raise InputError(
-            f"https: openssl made no certificate: {text or error}"
-        ) from None
+        raise _make_openssl_error(error) from None
+
+
+def _make_openssl_error(error: OSError | subprocess.SubprocessError) -> InputError:
+    """Return the error for a failure of openssl, with the end of what it printed."""
+    output: bytes = getattr(error, "stderr", None) or b""
+    text = output.decode(errors="replace")[-300:]  # the end has the reason
+    return InputError(f"https: openssl made no certificate: {text or error}")
+
+
+def _make_openssl_command(
+    hosts: Sequence[str], key: Path, certificate: Path
+) -> list[str]:
+    """Return the command that writes a key and a self-signed certificate for hosts."""
+    names = ",".join(
+        f"IP:{host}" if is_address(host) else f"DNS:{host}"
+        for host in dict.fromkeys(hosts)
+    )
+    return [
+        *("openssl", "req", "-x509"),
+        *("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes"),
+        *("-keyout", str(key), "-out", str(certificate)),
+        *("-days", str(DAYS), "-subj", "/CN=advsearch"),
+        *("-addext", f"subjectAltName={names}"),
+        *("-addext", "extendedKeyUsage=serverAuth"),
+    ]
 
 
 def is_address(host: str) -> bool:
@@ -215,25 +235,35 @@ def restrict_connections(allowed: bool, tries: list[object]) -> Iterator[None]:
         return
     # Methods of sockets are replaced, since all libraries use them to connect.
     names = ("connect", "connect_ex")
-    thread = threading.get_ident()
     before = {name: getattr(socket.socket, name) for name in names}
-
-    def make_rejecting(name: str) -> Callable[[socket.socket, Any], Any]:
-        """Return a replacement of a method that rejects this thread's connections."""
-
-        def connect(self: socket.socket, address: Any) -> Any:
-            """Connect as usual in other threads, and raise an error in this one."""
-            if threading.get_ident() != thread:
-                return before[name](self, address)
-            tries.append(address)
-            raise ConnectionRefusedError("only a file names this model")
-
-        return connect
-
     for name in names:
-        setattr(socket.socket, name, make_rejecting(name))
+        rejecting = _make_rejecting(before[name], threading.get_ident(), tries)
+        setattr(socket.socket, name, rejecting)
     try:
         yield
     finally:
         for name in names:
             setattr(socket.socket, name, before[name])
+
+
+def _make_rejecting(
+    connect_as_usual: Callable[[socket.socket, Any], Any],
+    thread: int,
+    tries: list[object],
+) -> Callable[[socket.socket, Any], Any]:
+    """Return a replacement of a method that rejects the connections of a thread.
+
+    Args:
+        connect_as_usual: the method, which other threads call.
+        thread: identifier of the thread.
+        tries: list to which the address of each rejected connection is appended.
+    """
+
+    def connect(self: socket.socket, address: Any) -> Any:
+        """Connect as usual in other threads, and raise an error in this one."""
+        if threading.get_ident() != thread:
+            return connect_as_usual(self, address)
+        tries.append(address)
+        raise ConnectionRefusedError("only a file names this model")
+
+    return connect

@@ -89,13 +89,44 @@ def check_request(
             HTTPStatus.FORBIDDEN,
             "this is not the address of the server; open the address that it printed",
         )
+    _check_origin(headers, f"{scheme}://{host}")
+    _check_site(command, headers)
+    if token is not None and not _has_token(path, headers, port, token):
+        raise RequestRejected(
+            HTTPStatus.UNAUTHORIZED,
+            "the token is missing; open the address that was printed",
+        )
+
+
+def _check_origin(headers: Message, server_origin: str) -> None:
+    """Check that a request is not from a page of another origin.
+
+    Args:
+        headers: headers of the request.
+        server_origin: the origin of our pages, such as "http://localhost:8265".
+
+    Raises:
+        RequestRejected: it is from such a page.
+    """
     origin = headers.get("Origin")
-    if origin is not None and origin != f"{scheme}://{host}":
+    if origin is not None and origin != server_origin:
         raise RequestRejected(
             HTTPStatus.FORBIDDEN,
             "the request is from a page of another origin; open the address that was "
             "printed",
         )
+
+
+def _check_site(command: str, headers: Message) -> None:
+    """Check that a request is not from another site, unless it follows a link.
+
+    Args:
+        command: HTTP method, such as "GET".
+        headers: headers of the request.
+
+    Raises:
+        RequestRejected: it is from another site.
+    """
     # "none" is a request of the user, such as an address that was typed. The header is
     # missing in requests of programs and old browsers.
     site = headers.get("Sec-Fetch-Site", "none")
@@ -106,11 +137,6 @@ def check_request(
     if not is_same_origin and not follows_link:
         raise RequestRejected(
             HTTPStatus.FORBIDDEN, "the request is from a page of another site"
-        )
-    if token is not None and not _has_token(path, headers, port, token):
-        raise RequestRejected(
-            HTTPStatus.UNAUTHORIZED,
-            "the token is missing; open the address that was printed",
         )
 
 

@@ -55,11 +55,24 @@ def run_converter(
             timeout=longest,
         )
     except subprocess.TimeoutExpired:
-        raise FileFormatError(
-            f"{path}: {program} had not read it after {longest} seconds; export glTF "
-            f"(.glb) from it yourself, or give it longer: {FACTOR}=10 in the "
-            "environment makes all limits ten times as large"
-        ) from None
+        raise _make_converter_timeout_error(path, program, longest) from None
+
+
+def _make_converter_timeout_error(
+    path: Path, program: str, seconds: int
+) -> FileFormatError:
+    """Return the error for a program that takes too long to read a file.
+
+    Args:
+        path: path of the file.
+        program: name of the program.
+        seconds: the time limit.
+    """
+    return FileFormatError(
+        f"{path}: {program} had not read it after {seconds} seconds; export glTF "
+        f"(.glb) from it yourself, or give it longer: {FACTOR}=10 in the environment "
+        "makes all limits ten times as large"
+    )
 
 
 def make_environment(folder: str) -> dict[str, str]:
@@ -94,20 +107,10 @@ def find_blender(who: str, otherwise: str) -> list[str]:
     Raises:
         FileFormatError: there is no Blender.
     """
-    program = os.environ.get(BLENDER) or shutil.which("blender")
-    if program is None and importlib.util.find_spec("bpy") is not None:
-        # this Python has Blender as a package
-        program = sys.executable
+    program = _find_blender_program()
     executable = shutil.which(program or "")
     if executable is None:
-        missing = "none is installed"
-        if program is not None:
-            missing = f"{BLENDER} names {program}, which can't be run"
-        raise FileFormatError(
-            f"{who}, and {missing}; install Blender so that `blender` is found, or "
-            "type `python3.11 -m venv bpy && bpy/bin/pip install bpy` and set "
-            f"{BLENDER}=bpy/bin/python; or {otherwise}"
-        )
+        raise _make_blender_error(program, who, otherwise)
     program = os.path.abspath(executable)
     is_python = Path(program).name.startswith("python")  # one with the package bpy
     if is_python:
@@ -116,10 +119,36 @@ def find_blender(who: str, otherwise: str) -> list[str]:
     # If the script fails, the exit status is 1.
     return [
         program,
-        "--background",
-        "--factory-startup",
-        "--disable-autoexec",
-        "--python-exit-code",
-        "1",
-        "--python",
+        *("--background", "--factory-startup", "--disable-autoexec"),
+        *("--python-exit-code", "1", "--python"),
     ]
+
+
+def _find_blender_program() -> str | None:
+    """Return the name or path of Blender, or of a Python with the package `bpy`; None
+    if there is neither.
+    """
+    program = os.environ.get(BLENDER) or shutil.which("blender")
+    if program is None and importlib.util.find_spec("bpy") is not None:
+        return sys.executable  # this Python has Blender as a package
+    return program
+
+
+def _make_blender_error(
+    program: str | None, who: str, otherwise: str
+) -> FileFormatError:
+    """Return the error for a Blender that is missing or cannot be run.
+
+    Args:
+        program: the program that is no executable; None if none is installed.
+        who: beginning of the message, which states what needs Blender.
+        otherwise: end of the message, which states what else the user can do.
+    """
+    missing = "none is installed"
+    if program is not None:
+        missing = f"{BLENDER} names {program}, which can't be run"
+    return FileFormatError(
+        f"{who}, and {missing}; install Blender so that `blender` is found, or "
+        "type `python3.11 -m venv bpy && bpy/bin/pip install bpy` and set "
+        f"{BLENDER}=bpy/bin/python; or {otherwise}"
+    )

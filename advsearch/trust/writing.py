@@ -235,11 +235,7 @@ def check_not_moved(path: Path) -> None:
         if folder not in _open:
             continue
         results = _open[folder]
-        try:
-            is_same_file = _get_file_id(results.path.stat()) == results.file_id
-        except OSError:
-            is_same_file = False
-        if not is_same_file:
+        if not _is_same_file(results.path, results.file_id):
             raise StorageError(
                 f"{folder}: the folder of this run was removed or renamed while the "
                 "run went on; start it again, or go on with what was renamed by "
@@ -248,6 +244,19 @@ def check_not_moved(path: Path) -> None:
 
 
 LOCK = ".lock"
+
+
+def _is_same_file(path: Path, file_id: tuple[int, int]) -> bool:
+    """Return whether a path still leads to the file that it led to.
+
+    Args:
+        path: path of the file.
+        file_id: what `_get_file_id` returned for the file before.
+    """
+    try:
+        return _get_file_id(path.stat()) == file_id
+    except OSError:
+        return False
 
 
 def _make_lock_error(folder: Path, error: OSError, pid: str) -> Exception:
@@ -286,18 +295,10 @@ class RunLock:
             FileFormatError: the lock is no ordinary file.
         """
         self._path = folder / LOCK
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
         with storage_errors(self._path):
-            self._descriptor = os.open(
-                self._path,
-                os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK,
-                0o644,
-            )
-        if not stat.S_ISREG(os.fstat(self._descriptor).st_mode):
-            self.release()
-            raise FileFormatError(
-                f"{self._path}: expected an ordinary file, got a pipe or the like; "
-                "remove it"
-            )
+            self._descriptor = os.open(self._path, flags, 0o644)
+        self._check_ordinary_file()
         try:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             os.truncate(self._descriptor, 0)
@@ -308,6 +309,19 @@ class RunLock:
             pid = os.pread(self._descriptor, 32, 0).decode(errors="replace")
             self.release()
             raise _make_lock_error(folder, error, pid) from None
+
+    def _check_ordinary_file(self) -> None:
+        """Check that the lock is an ordinary file; otherwise close it.
+
+        Raises:
+            FileFormatError: it is something else.
+        """
+        if not stat.S_ISREG(os.fstat(self._descriptor).st_mode):
+            self.release()
+            raise FileFormatError(
+                f"{self._path}: expected an ordinary file, got a pipe or the like; "
+                "remove it"
+            )
 
     def release(self) -> None:
         """Release the lock, if it is held."""
@@ -352,35 +366,53 @@ def check_no_links(run: Path, contents: Collection[str], unchecked_suffix: str) 
     folders = [str(run)]
     while folders:
         folder = folders.pop()
-        is_root = folder == str(run)
-        try:
-            with os.scandir(folder) as entries:
-                # In the folder of the run itself, other names are ignored.
-                inside = [
-                    entry
-                    for entry in entries
-                    if not is_root or entry.name in (*contents, LOCK)
-                ]
-        except OSError as error:
-            if error.errno == errno.ENOENT:  # it was removed meanwhile
-                continue
-            raise FileFormatError(
-                f"{folder}: expected a folder of a run, got {error.strerror}"
-            ) from None
-        for entry in inside:
-            if entry.is_symlink():
-                raise FileFormatError(
-                    f"{entry.path}: expected a file or a folder of this run, got a "
-                    "link; remove it"
-                )
-            if entry.is_dir(follow_symlinks=False):
-                # `folder` is the one that contains this subfolder.
-                checks_subfolders = not folder.endswith(unchecked_suffix)
-                if checks_subfolders:
-                    folders.append(entry.path)  # its contents are checked, too
-            # `RunLock` checks the lock itself when it opens it.
-            elif not entry.is_file(follow_symlinks=False) and entry.name != LOCK:
-                raise FileFormatError(
-                    f"{entry.path}: expected a file of this run, got a "
-                    "pipe or the like; remove it"
-                )
+        # In the folder of the run itself, other names are ignored.
+        checked_names = (*contents, LOCK) if folder == str(run) else None
+        for entry in _list_entries(folder, checked_names):
+            _check_entry_kind(entry)
+            # `folder` is the one that contains this subfolder.
+            checks_subfolders = not folder.endswith(unchecked_suffix)
+            if entry.is_dir(follow_symlinks=False) and checks_subfolders:
+                folders.append(entry.path)  # its contents are checked, too
+
+
+def _list_entries(folder: str, names: Collection[str] | None) -> list[os.DirEntry[str]]:
+    """Return the entries of a folder; an empty list if the folder was removed.
+
+    Args:
+        folder: path of the folder.
+        names: names of the entries to return; None for all.
+
+    Raises:
+        FileFormatError: it cannot be read.
+    """
+    try:
+        with os.scandir(folder) as entries:
+            return [entry for entry in entries if names is None or entry.name in names]
+    except OSError as error:
+        if error.errno == errno.ENOENT:  # it was removed meanwhile
+            return []
+        raise FileFormatError(
+            f"{folder}: expected a folder of a run, got {error.strerror}"
+        ) from None
+
+
+def _check_entry_kind(entry: os.DirEntry[str]) -> None:
+    """Check that an entry of a run's folder is a file or a folder.
+
+    Raises:
+        FileFormatError: it is a link, a pipe or another special file.
+    """
+    if entry.is_symlink():
+        raise FileFormatError(
+            f"{entry.path}: expected a file or a folder of this run, got a "
+            "link; remove it"
+        )
+    if entry.is_dir(follow_symlinks=False):
+        return
+    # `RunLock` checks the lock itself when it opens it.
+    if not entry.is_file(follow_symlinks=False) and entry.name != LOCK:
+        raise FileFormatError(
+            f"{entry.path}: expected a file of this run, got a "
+            "pipe or the like; remove it"
+        )

@@ -73,6 +73,19 @@ _Loader.add_implicit_resolver(
 )
 
 
+_YAML_ERRORS = (
+    yaml.YAMLError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    OverflowError,
+)
+"""Errors that PyYAML raises. Its constructors raise all of them for values that do not
+fit their tags.
+"""
+
+
 def parse_yaml(text: str) -> Any:
     """Return the value of a YAML text.
 
@@ -87,23 +100,19 @@ def parse_yaml(text: str) -> Any:
     except RecursionError:
         raise ValueError(f"lists or mappings nested deeper than {DEPTH}") from None
     except yaml.MarkedYAMLError as error:
-        # Our own errors (`_make_yaml_error`) have a note. Other errors come from PyYAML.
-        got = error.note or f"other text ({error.problem or error.context})"
-        mark = error.problem_mark or error.context_mark
-        if mark is not None:
-            got = f"{got} in line {mark.line + 1}, column {mark.column + 1}"
-        raise ValueError(_shorten(got)) from None
-    except (
-        yaml.YAMLError,
-        ValueError,
-        LookupError,
-        TypeError,
-        AttributeError,
-        OverflowError,
-    ) as error:
-        # The constructors of PyYAML raise all of these for values that do not fit their
-        # tags.
+        raise ValueError(_describe_yaml_error(error)) from None
+    except _YAML_ERRORS as error:
         raise ValueError(_shorten(str(error))) from None
+
+
+def _describe_yaml_error(error: Any) -> str:
+    """Return what is wrong with a text, and where, from an error of PyYAML."""
+    # Our own errors (`_make_yaml_error`) have a note. Other errors come from PyYAML.
+    got = error.note or f"other text ({error.problem or error.context})"
+    mark = error.problem_mark or error.context_mark
+    if mark is not None:
+        got = f"{got} in line {mark.line + 1}, column {mark.column + 1}"
+    return _shorten(got)
 
 
 def _shorten(text: str) -> str:
@@ -144,17 +153,21 @@ def _count_checked(node: yaml.Node, depth: int, counts: dict[int, int]) -> int:
         _check_names(node)
     if id(node) not in counts:
         counts[id(node)] = _UNFINISHED
-        if isinstance(node, yaml.SequenceNode):
-            children = node.value
-        else:  # names and values
-            children = [child for pair in node.value for child in pair]
         total = 1
-        for child in children:
+        for child in _list_children(node):
             total += _count_checked(child, depth + 1, counts)
             if total > MAX_VALUES:
                 raise _make_yaml_error(node, f"more than {MAX_VALUES:,} values")
         counts[id(node)] = total
     return counts[id(node)]  # an alias counts as much as its node
+
+
+def _list_children(node: yaml.Node) -> list[yaml.Node]:
+    """Return the items of a list, or the names and values of a mapping."""
+    if isinstance(node, yaml.SequenceNode):
+        items: list[yaml.Node] = node.value
+        return items
+    return [child for pair in node.value for child in pair]
 
 
 def _check_names(node: yaml.MappingNode) -> None:

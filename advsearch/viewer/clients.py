@@ -52,20 +52,31 @@ def find_reachable_address(host: str) -> str:
     """
     if host not in ("0.0.0.0", "::", ""):
         return host
-    # a machine far away; these addresses are for documentation, RFC 3849 and RFC 5737
-    family = socket.AF_INET
-    remote = "192.0.2.1"
-    if host == "::":
-        family = socket.AF_INET6
-        remote = "2001:db8::1"
+    # The remote address is of a machine far away; these addresses are for
+    # documentation, RFC 3849 and RFC 5737.
     try:
-        with socket.socket(family, socket.SOCK_DGRAM) as probe:
-            # nothing is sent: the system only chooses the address of this machine from
-            # which it would send, whatever the port
-            probe.connect((remote, 9))
-            return str(probe.getsockname()[0])
+        if host == "::":
+            return _find_sending_address(socket.AF_INET6, "2001:db8::1")
+        return _find_sending_address(socket.AF_INET, "192.0.2.1")
     except OSError:
         return "::1" if host == "::" else "127.0.0.1"
+
+
+def _find_sending_address(family: socket.AddressFamily, remote: str) -> str:
+    """Return the address from which this machine would send to another one.
+
+    Args:
+        family: family of both addresses.
+        remote: address of the other machine.
+
+    Raises:
+        OSError: there is no network.
+    """
+    with socket.socket(family, socket.SOCK_DGRAM) as probe:
+        # nothing is sent: the system only chooses the address of this machine from
+        # which it would send, whatever the port
+        probe.connect((remote, 9))
+        return str(probe.getsockname()[0])
 
 
 @dataclass(eq=False)
@@ -82,6 +93,16 @@ class _Connection:
     connection: socket.socket
     since: float = math.inf
     due: float = math.inf
+
+    def disconnect(self) -> None:
+        """End the connection, on which the worker's next read or write then fails."""
+        # These values make it neither slow nor overdue, so that it is not disconnected
+        # twice.
+        self.since = math.inf
+        self.due = math.inf
+        # The plain method: that of an SSL socket would forget that it is one.
+        with suppress(OSError):
+            socket.socket.shutdown(self.connection, socket.SHUT_RDWR)
 
 
 class _SilentClient(NamedTuple):
@@ -134,22 +155,22 @@ class ConnectionPool:
         This thread accepts connections, and worker threads serve them.
         """
         self._ended.clear()
-
-        def work() -> None:
-            while True:
-                job = self._ready.get()
-                if job is None:  # put by `close`
-                    return
-                connection, address = job
-                self.serve_connection(connection, address)
-
         for _ in range(N_WORKERS):
-            threading.Thread(target=work, daemon=True).start()
+            threading.Thread(target=self._serve_ready, daemon=True).start()
         try:
             with selectors.DefaultSelector() as selector:
                 self._watch(selector)
         finally:
             self._ended.set()
+
+    def _serve_ready(self) -> None:
+        """Serve the connections that are ready, until the pool is closed."""
+        while True:
+            job = self._ready.get()
+            if job is None:  # put by `close`
+                return
+            connection, address = job
+            self.serve_connection(connection, address)
 
     def close(self) -> None:
         """End `serve`, and close the connections that wait for a worker."""
@@ -205,29 +226,36 @@ class ConnectionPool:
                 selector.unregister(self._listening)
             listens = has_room
             for key, _ in selector.select(CHECK_INTERVAL):
-                connection: Any = key.fileobj
-                if connection is self._listening:
-                    with suppress(OSError):  # the client may have gone
-                        connection, address = self._listening.accept()
-                        silent[connection] = _SilentClient(address, time.monotonic())
-                        selector.register(connection, selectors.EVENT_READ)
-                else:  # a silent client has sent something
-                    selector.unregister(connection)
-                    client = silent.pop(connection)
-                    self._ready.put((connection, client.address))
+                self._accept_or_pass_on(key.fileobj, silent, selector)
             now = time.monotonic()
-            # silent clients have less time if others wait
-            max_silence = REQUEST_SECONDS
-            if not has_room:
-                max_silence = min(REQUEST_SECONDS, SLOW_CLIENT_SECONDS)
-            for connection, client in list(silent.items()):
-                if now - client.since > max_silence:
-                    del silent[connection]
-                    selector.unregister(connection)
-                    connection.close()
+            _close_silent(silent, selector, now, others_wait=not has_room)
             self._end_slow_clients(now)
         for connection in silent:
             connection.close()
+
+    def _accept_or_pass_on(
+        self,
+        connection: Any,
+        silent: dict[Any, _SilentClient],
+        selector: selectors.BaseSelector,
+    ) -> None:
+        """Accept a new connection, or pass one that has sent something to the workers.
+
+        Args:
+            connection: the socket at which something has come: the one that listens, or
+                that of a silent client.
+            silent: silent clients by connection, which are changed.
+            selector: selector that waits for all sockets.
+        """
+        if connection is self._listening:
+            with suppress(OSError):  # the client may have gone
+                connection, address = self._listening.accept()
+                silent[connection] = _SilentClient(address, time.monotonic())
+                selector.register(connection, selectors.EVENT_READ)
+        else:  # a silent client has sent something
+            selector.unregister(connection)
+            client = silent.pop(connection)
+            self._ready.put((connection, client.address))
 
     def _end_slow_clients(self, now: float) -> None:
         """Disconnect clients for which a worker has waited too long.
@@ -239,9 +267,8 @@ class ConnectionPool:
         Args:
             now: the present time (`time.monotonic`).
         """
-        clients = sorted(
-            self._connections.copy().values(), key=lambda client: client.since
-        )
+        clients = list(self._connections.copy().values())
+        clients.sort(key=lambda client: client.since)  # the slowest first
         n_needed_workers = 0  # as long as a worker is free, none is needed
         if len(clients) == N_WORKERS:
             n_needed_workers = self._ready.qsize()
@@ -252,14 +279,7 @@ class ConnectionPool:
             if not is_overdue and not must_make_room:
                 continue
             n_needed_workers -= 1  # its worker becomes free
-            # These values make it neither slow nor overdue, so that it is not
-            # disconnected twice.
-            client.since = math.inf
-            client.due = math.inf
-            # The worker's next read or write ends then. (The plain method: that of an SSL
-            # socket would forget that it is one.)
-            with suppress(OSError):
-                socket.socket.shutdown(client.connection, socket.SHUT_RDWR)
+            client.disconnect()
 
     def serve_connection(self, connection: socket.socket, address: Any) -> None:
         """Serve one client in this thread.
@@ -275,11 +295,7 @@ class ConnectionPool:
         try:
             connection.setblocking(True)
             if self._context is not None:
-                # The handshake waits for the client. So it is done below, where the
-                # waiting time is measured.
-                connection = self._context.wrap_socket(
-                    connection, server_side=True, do_handshake_on_connect=False
-                )
+                connection = _encrypt_without_handshake(connection, self._context)
             self._connections[thread] = _Connection(connection)
             self.report_waiting(REQUEST_SECONDS)
             if isinstance(connection, ssl.SSLSocket):
@@ -292,6 +308,48 @@ class ConnectionPool:
             with suppress(OSError):
                 # the plain method: that of an SSL socket would forget that it is one
                 socket.socket.shutdown(connection, socket.SHUT_WR)
+            connection.close()
+
+
+def _encrypt_without_handshake(
+    connection: socket.socket, context: ssl.SSLContext
+) -> ssl.SSLSocket:
+    """Return a connection that is encrypted after its handshake.
+
+    The handshake waits for the client. So it is done later, where the waiting time is
+    measured.
+
+    Args:
+        connection: socket of the plain connection, which is not used afterwards.
+        context: TLS context of the server.
+    """
+    return context.wrap_socket(
+        connection, server_side=True, do_handshake_on_connect=False
+    )
+
+
+def _close_silent(
+    silent: dict[Any, _SilentClient],
+    selector: selectors.BaseSelector,
+    now: float,
+    *,
+    others_wait: bool,
+) -> None:
+    """Close connections that have been silent for too long.
+
+    Args:
+        silent: silent clients by connection; those that are closed are removed.
+        selector: selector that waits for them.
+        now: the present time (`time.monotonic`).
+        others_wait: whether other connections wait, so that there is less time.
+    """
+    max_silence = REQUEST_SECONDS
+    if others_wait:
+        max_silence = min(REQUEST_SECONDS, SLOW_CLIENT_SECONDS)
+    for connection, client in list(silent.items()):
+        if now - client.since > max_silence:
+            del silent[connection]
+            selector.unregister(connection)
             connection.close()
 
 

@@ -11,6 +11,7 @@ import math
 from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -113,20 +114,30 @@ def read_columns(
     from advsearch.runs.tables import read_sweep  # pandas takes half a second
 
     boxes = Boxes()
-
-    def read_corners(row: Row) -> Mapping[str, float]:
-        """Return the corners of a row; its stored payload may be corrupt."""
-        try:
-            return _read_corners(row, boxes)
-        except (LookupError, TypeError, ValueError, OverflowError, AttributeError):
-            raise FileFormatError(
-                f"{run / NAME}: row {row.id}: expected boxes of a detector, got "
-                f"something else; {DAMAGED}"
-            ) from None
-
+    read_corners = partial(_read_corners_or_raise, run, boxes)
     rows = read_sweep(run, after, max_rows, read_corners)
     rows.attrs[BOXES_ATTRIBUTE] = boxes
     return rows
+
+
+def _read_corners_or_raise(run: Path, boxes: Boxes, row: Row) -> Mapping[str, float]:
+    """Return the corners of a row, whose stored payload may be corrupt.
+
+    Args:
+        run: directory of the run, for the message.
+        boxes: gets all boxes of the row.
+        row: the row.
+
+    Raises:
+        FileFormatError: it is corrupt.
+    """
+    try:
+        return _read_corners(row, boxes)
+    except (LookupError, TypeError, ValueError, OverflowError, AttributeError):
+        raise FileFormatError(
+            f"{run / NAME}: row {row.id}: expected boxes of a detector, got "
+            f"something else; {DAMAGED}"
+        ) from None
 
 
 def _read_corners(row: Row, boxes: Boxes) -> Mapping[str, float]:
@@ -146,11 +157,7 @@ def _read_corners(row: Row, boxes: Boxes) -> Mapping[str, float]:
     if isinstance(payload, dict) and "box" in payload:
         best_box = _find_best_detection(row, payload)
         boxes.add(payload)
-        values = list[float]()
-        for box in (payload["box"], best_box):
-            corners_of_box = box or [None] * 4  # without a box four NaN
-            for corner in corners_of_box:
-                values.append(math.nan if corner is None else float(corner))
+        values = [*_list_corner_values(payload["box"]), *_list_corner_values(best_box)]
         corners = dict(zip(CORNERS, values, strict=True))
     # Every row gets an entry, also one without boxes.
     n_boxes_so_far = len(boxes.values) // VALUES_PER_BOX
@@ -170,6 +177,12 @@ def _find_best_detection(row: Row, payload: Mapping[str, Any]) -> Any:
         if detection["label"] == label:
             return detection["box"]
     return None
+
+
+def _list_corner_values(box: Sequence[float | None] | None) -> list[float]:
+    """Return the four numbers of a box; NaN for a number or a box that does not exist."""
+    numbers = box or [None] * 4
+    return [math.nan if number is None else float(number) for number in numbers]
 
 
 def pack_columns(
@@ -201,8 +214,6 @@ def pack_columns(
     # The columns with the largest values first. `itemsize` is the bytes of one value,
     # also in a column with several values for each row.
     arrays = sorted(columns.items(), key=lambda item: -item[1].itemsize)
-
-    boxes: Boxes | None = rows.attrs.get(BOXES_ATTRIBUTE)
     head = {
         "count": len(rows),
         "last": int(rows["id"].iloc[-1]) if len(rows) else 0,
@@ -211,15 +222,26 @@ def pack_columns(
         "answers": labels,
         "outcomes": outcome_names,
         "parameters": parameters,
-        "things": list(boxes.names) if boxes is not None else [],
+        "things": _list_thing_names(rows),
         "columns": _make_layout(arrays),
     }
-    head_data = json.dumps(head).encode()
-    head_data += b" " * (-len(head_data) % 4)  # up to a multiple of 4 bytes
     data = [
         values.astype(values.dtype.newbyteorder("<")).tobytes() for _, values in arrays
     ]
-    return b"".join([len(head_data).to_bytes(4, "little"), head_data, *data])
+    return b"".join([*_encode_head(head), *data])
+
+
+def _list_thing_names(rows: pd.DataFrame) -> list[str]:
+    """Return the names of the objects with boxes; an empty list without boxes."""
+    boxes: Boxes | None = rows.attrs.get(BOXES_ATTRIBUTE)
+    return list(boxes.names) if boxes is not None else []
+
+
+def _encode_head(head: Mapping[str, object]) -> tuple[bytes, bytes]:
+    """Return the length of a head as a uint32, and the head as padded JSON."""
+    head_data = json.dumps(head).encode()
+    head_data += b" " * (-len(head_data) % 4)  # up to a multiple of 4 bytes
+    return len(head_data).to_bytes(4, "little"), head_data
 
 
 def _make_layout(
@@ -233,19 +255,32 @@ def _make_layout(
     layout = list[dict[str, object]]()
     offset = 0
     for name, values in arrays:
-        entry: dict[str, object] = {
-            "name": name,
-            "type": values.dtype.name,
-            "at": offset,
-            "width": values.size // max(len(values), 1),
-        }
-        # Rows have different numbers of boxes, so that the length of this column does
-        # not follow from the number of rows.
-        if name == "others":
-            entry["length"] = values.size
-        layout.append(entry)
+        layout.append(_describe_column(name, values, offset))
         offset += values.nbytes
     return layout
+
+
+def _describe_column(
+    name: str, values: npt.NDArray[Any], offset: int
+) -> dict[str, object]:
+    """Return the entry of a column in the layout.
+
+    Args:
+        name: name of the column.
+        values: its values, (n,) or (n, values for each row).
+        offset: bytes of the columns before it.
+    """
+    entry: dict[str, object] = {
+        "name": name,
+        "type": values.dtype.name,
+        "at": offset,
+        "width": values.size // max(len(values), 1),
+    }
+    # Rows have different numbers of boxes, so that the length of this column does not
+    # follow from the number of rows.
+    if name == "others":
+        entry["length"] = values.size
+    return entry
 
 
 def _prediction_columns(
@@ -261,10 +296,6 @@ def _prediction_columns(
     """
     label_indices, label_names = _encode_levels(rows["label"])
     outcome_indices, outcome_names = _encode_levels(rows["outcome"])
-    probability = 10_000 * rows["probability"].clip(0.0, 1.0).to_numpy()
-    probability = np.where(
-        np.isnan(probability), NO_PROBABILITY, probability.round()
-    ).astype(np.uint16)
     # If the object is not visible, it is unknown whether the prediction is right.
     is_in_view = rows["label"] != OUT_OF_VIEW
     is_right = rows["correct"].where(is_in_view).fillna(UNKNOWN)
@@ -272,12 +303,19 @@ def _prediction_columns(
         "step": rows["step"].to_numpy(np.uint32),
         "margin": rows["margin"].to_numpy(np.float32),
         "answer": label_indices,
-        "probability": probability,
+        "probability": _encode_probabilities(rows["probability"]),
         "outcome": outcome_indices,
         "right": is_right.to_numpy(np.uint8),
         "unit": rows["unit"].to_numpy(np.uint32),
     }
     return columns, label_names, outcome_names
+
+
+def _encode_probabilities(column: pd.Series) -> npt.NDArray[np.uint16]:
+    """Return probabilities in units of 1/10000, or `NO_PROBABILITY`."""
+    probability = 10_000 * column.clip(0.0, 1.0).to_numpy()
+    encoded = np.where(np.isnan(probability), NO_PROBABILITY, probability.round())
+    return encoded.astype(np.uint16)
 
 
 def _parameter_columns(
@@ -294,19 +332,26 @@ def _parameter_columns(
     parameters = list[dict[str, object]]()
     for index, (name, unit) in enumerate(rows.attrs["units"].items()):
         column = rows[name]
-        levels = None
         if column.dtype == "category":  # names, which have no unit
             unit = ""
-            values, levels = _encode_levels(column)
-        else:
-            # values too large for float32 become infinite, without a warning
-            with np.errstate(over="ignore"):
-                values = column.to_numpy(np.float32)
+        values, levels = _encode_values(column)
         columns[f"parameter {index}"] = values
         parameters.append(
             {"name": name, "unit": unit, "levels": levels, "edges": edges.get(name)}
         )
     return columns, parameters
+
+
+def _encode_values(column: pd.Series) -> tuple[Any, list[str] | None]:
+    """Return the values of a parameter as numbers, and the names that they stand for.
+
+    The names are None if the numbers are values.
+    """
+    if column.dtype == "category":
+        return _encode_levels(column)
+    # values too large for float32 become infinite, without a warning
+    with np.errstate(over="ignore"):
+        return column.to_numpy(np.float32), None
 
 
 def _box_columns(rows: pd.DataFrame) -> dict[str, Any]:

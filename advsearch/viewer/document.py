@@ -66,9 +66,7 @@ def make_document(
     """
     code = _join_scripts(scripts)
     # By the policy of the page, only scripts with these digests run.
-    digests: list[str] = []
-    if code:
-        digests = [pages.compute_script_digest(code.encode())]
+    digests = [pages.compute_script_digest(code.encode())] if code else []
     policy = pages.make_page_policy(digests, connects=connects)
     head = _make_head(title, f"{policy}; form-action 'self'")
     footer_html = make_element("footer", f"advsearch {__version__}, {footer or title}")
@@ -250,28 +248,44 @@ def make_table(
             end, mark) as fractions of its width; None for no interval.
     """
     lines = []
-    for row, (name, *texts) in enumerate(rows):
+    for row, texts in enumerate(rows):
         link = links[row] if row < len(links) else ""
-        linked_name = make_element("a", name, href=link) if link else name
-        cells = [make_element("th", linked_name, scope="row")]
-        for column, text in enumerate(texts, 1):  # the name is column 0
-            share = (shares or {}).get((row, column))
-            cells.append(make_element("td", text, class_=_cell_class(text, share)))
+        cells = _make_body_cells(row, texts, link, shares or {})
         if bars:
-            cells.append(
-                make_element("td", _interval_bar(bars[row]), class_="hide-small")
-            )
+            bar = _interval_bar(bars[row])
+            cells.append(make_element("td", bar, class_="hide-small"))
         lines.append(make_element("tr", *cells))
+    head = _make_table_head(heads, has_bars=bool(bars))
+    return make_scrollable(make_element("table", head, make_element("tbody", *lines)))
+
+
+def _make_body_cells(
+    row: int, texts: Sequence[str], link: str, shares: Mapping[tuple[int, int], float]
+) -> list[Html]:
+    """Return the cells of a row that begins with its name.
+
+    Args:
+        row: index of the row.
+        texts: texts of its cells, the name first.
+        link: address to which the name links; "" for none.
+        shares: fractions that determine the colors of cells, by (row, column).
+    """
+    name, *other_texts = texts
+    linked_name = make_element("a", name, href=link) if link else name
+    cells = [make_element("th", linked_name, scope="row")]
+    for column, text in enumerate(other_texts, 1):  # the name is column 0
+        share = shares.get((row, column))
+        cells.append(make_element("td", text, class_=_cell_class(text, share)))
+    return cells
+
+
+def _make_table_head(heads: Sequence[str], *, has_bars: bool) -> Html:
+    """Return the head of a table, with an empty cell for a column of bars."""
     bar_head = None
-    if bars:  # an empty head for the column of bars
+    if has_bars:
         bar_head = make_element("td", class_="hide-small")
     column_heads = (make_element("th", text, scope="col") for text in heads)
-    head = make_element("tr", *column_heads, bar_head)
-    return make_scrollable(
-        make_element(
-            "table", make_element("thead", head), make_element("tbody", *lines)
-        )
-    )
+    return make_element("thead", make_element("tr", *column_heads, bar_head))
 
 
 def _cell_class(text: str, share: float | None) -> str:

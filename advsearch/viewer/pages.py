@@ -9,9 +9,9 @@ import base64
 import json
 import shlex
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from advsearch import registry
 from advsearch.errors import FileFormatError
@@ -103,32 +103,49 @@ def _part_content(run: Path, part: ResultPart, description: str) -> Html:
     """
     content = list[Html | None]()
     if part.draw is not None:
-        alt = " ".join([f"{part.title}.", *(part.text or [description])])
-        # The page has a wide chart and a narrow one. Its style sheet displays the one
-        # that fits the window.
-        charts = [
-            views.make_chart_svg(part.draw, alt, width, part.height)
-            for width in (views.WIDE_WIDTH, views.NARROW_WIDTH)
-        ]
-        content.append(make_element("div", *charts))
+        content.append(_make_charts(part.draw, part, description))
     else:
         content += [make_element("p", text) for text in part.text if text]
         alt = " ".join(part.text) or part.title
         content.append(_embed_figure(run, part.figure, alt))
-    if part.rows and part.column_heads:
-        links = document.link_parts(run, part.parts)
-        content.append(
-            document.make_table(
-                part.column_heads, part.rows, links, part.cell_fractions, part.bars
-            )
-        )
-    elif part.rows:  # without heads, the rows are pairs of a name and a value
-        content.append(document.facts_table({row[0]: row[1] for row in part.rows}))
+    content.append(_make_part_table(run, part))
     for group in part.pictures:
         content.append(_embed_images(run, group, part.layout))
     if part.note:
         content.append(make_element("p", part.note, class_="soft"))
     return join_html(*content)
+
+
+def _make_part_table(run: Path, part: ResultPart) -> Html | None:
+    """Return the table of a part; None if it has no rows."""
+    if not part.rows:
+        return None
+    if not part.column_heads:  # the rows are pairs of a name and a value
+        return document.facts_table({row[0]: row[1] for row in part.rows})
+    links = document.link_parts(run, part.parts)
+    return document.make_table(
+        part.column_heads, part.rows, links, part.cell_fractions, part.bars
+    )
+
+
+def _make_charts(
+    draw: Callable[[Any], object], part: ResultPart, description: str
+) -> Html:
+    """Return the chart of a part in two sizes.
+
+    Args:
+        draw: function that draws it on axes of matplotlib.
+        part: the part.
+        description: text for users who cannot see it, if the part has no text.
+    """
+    alt = " ".join([f"{part.title}.", *(part.text or [description])])
+    # The page has a wide chart and a narrow one. Its style sheet displays the one that
+    # fits the window.
+    charts = [
+        views.make_chart_svg(draw, alt, width, part.height)
+        for width in (views.WIDE_WIDTH, views.NARROW_WIDTH)
+    ]
+    return make_element("div", *charts)
 
 
 def _embed_images(run: Path, group: Iterable[Picture], layout: str) -> Html | None:
@@ -142,24 +159,28 @@ def _embed_images(run: Path, group: Iterable[Picture], layout: str) -> Html | No
     figures = []
     for picture in group:
         data = _read_image(run, picture)
-        if data is None:
-            continue
-        media_type = MEDIA_TYPES[Path(picture.file).suffix.lower()]
-        image = make_element(
-            "img",
-            src=document.make_data_url(data, media_type),
-            alt=": ".join(filter(None, (picture.name, picture.caption))),
-            data_picture=Path(picture.file).stem,
-        )
-        name = [make_element("strong", picture.name), ": "] if picture.name else []
-        caption = make_element("figcaption", *name, picture.caption)
-        figures.append(make_element("figure", image, caption))
+        if data is not None:
+            figures.append(_make_figure(picture, data))
     if not figures:
         return None
     is_pair = len(figures) <= 2
     if not layout and is_pair:
         layout = "pair"
     return make_element("div", *figures, class_=f"pictures {layout}".strip())
+
+
+def _make_figure(picture: Picture, data: bytes) -> Html:
+    """Return an image with its caption; `data` is the content of its file."""
+    media_type = MEDIA_TYPES[Path(picture.file).suffix.lower()]
+    image = make_element(
+        "img",
+        src=document.make_data_url(data, media_type),
+        alt=": ".join(filter(None, (picture.name, picture.caption))),
+        data_picture=Path(picture.file).stem,
+    )
+    name = [make_element("strong", picture.name), ": "] if picture.name else []
+    caption = make_element("figcaption", *name, picture.caption)
+    return make_element("figure", image, caption)
 
 
 def _read_image(run: Path, picture: Picture) -> bytes | None:
@@ -208,21 +229,38 @@ def make_page_end(run: Path, result: Result, view: ShownResult) -> Html:
         resume = shlex.join(["advsearch", "resume", str(run)])
         content += _make_command("Go on", resume)
     config_file = run / CONFIG
+    content += _explain_repeat(result, config_file)
+    if config_file.is_file():
+        content += _make_settings_html(config_file)
+    return join_html(*content)
+
+
+def _explain_repeat(result: Result, config_file: Path) -> list[Html]:
+    """Return the command that repeats a run, or why there is none.
+
+    Args:
+        result: result of the run.
+        config_file: file with its settings, which may be missing.
+    """
     # parts that exist only in a Python session, so that no file can name them
     python_only = getattr(result, "python_only", [])
     if python_only:
         repeat = f"No command repeats this: {format_python_only(python_only)}"
-        content += _make_command("Do it again", repeat)
-    elif config_file.is_file():
-        repeat = shlex.join(["advsearch", "run", str(config_file)])
-        content += _make_command("Do it again", repeat)
+        return _make_command("Do it again", repeat)
     if config_file.is_file():
-        settings = config_file.read_text(encoding="utf-8", errors="replace")
-        if settings:
-            settings_html = make_element("pre", settings, class_="wrap")
-            summary = make_element("summary", "All settings")
-            content.append(make_element("details", summary, settings_html))
-    return join_html(*content)
+        repeat = shlex.join(["advsearch", "run", str(config_file)])
+        return _make_command("Do it again", repeat)
+    return []
+
+
+def _make_settings_html(config_file: Path) -> list[Html]:
+    """Return the settings in a file, folded, in a list; an empty list if it is empty."""
+    settings = config_file.read_text(encoding="utf-8", errors="replace")
+    if not settings:
+        return []
+    settings_html = make_element("pre", settings, class_="wrap")
+    summary = make_element("summary", "All settings")
+    return [make_element("details", summary, settings_html)]
 
 
 def _make_command(title: str, command: str) -> list[Html]:
@@ -338,6 +376,28 @@ def make_view_page(
         data: scripts that only hold data.
         scripts: names of files with scripts that fill the parts that are `live`.
     """
+    content = _make_page_content(run, result, view)
+    eyebrow = _make_eyebrow(result, view)
+    return document.make_document(
+        f"{run.name}, {result.command}",
+        document.make_header(eyebrow, view.statement, views.list_remarks(result, view)),
+        make_element("main", *content, make_page_end(run, result, view)),
+        data=data,
+        scripts=scripts,
+        footer=f"run {run.name}. This page needs no other file.",
+    )
+
+
+def _make_page_content(
+    run: Path, result: Result, view: ShownResult
+) -> list[Html | None]:
+    """Return the images and parts of a result, and the list of the run's parts.
+
+    Args:
+        run: directory of the run.
+        result: result of the run.
+        view: the parts of the result that are displayed.
+    """
     content = list[Html | None]()
     has_chosen_images = any(
         part.draw or part.figure or part.pictures for part in view.sections
@@ -348,20 +408,17 @@ def make_view_page(
         if part.is_visible_in("page"):
             content.append(make_part(run, part, view.statement))
     content.append(_list_parts(run, list(getattr(result, "parts", ()))))
+    return content
+
+
+def _make_eyebrow(result: Result, view: ShownResult) -> Html:
+    """Return the line above the statement: the command and the subjects of a result."""
     subjects = views.list_subjects(result, view)
     # `make_subject_html` takes pairs of a prefix and a name; here there is no prefix
-    eyebrow = join_html(
+    return join_html(
         result.command,
         "; " if subjects else None,
         document.make_subject_html(*(("", name) for name in subjects)),
-    )
-    return document.make_document(
-        f"{run.name}, {result.command}",
-        document.make_header(eyebrow, view.statement, views.list_remarks(result, view)),
-        make_element("main", *content, make_page_end(run, result, view)),
-        data=data,
-        scripts=scripts,
-        footer=f"run {run.name}. This page needs no other file.",
     )
 
 

@@ -93,21 +93,30 @@ def make_list_page(runs: Mapping[str, Path]) -> str:
     ]
     # the newest first; runs with an unknown time of their start last
     listed.sort(key=lambda item: item[1].when or 0.0, reverse=True)
+    if not listed:
+        content = make_element(
+            "p", "No runs here yet: advsearch sweep, or advsearch attack, makes one."
+        )
+    else:
+        content = _make_runs_form(listed)
+    title = make_element("header", make_element("h1", "Runs"))
+    return make_document("Runs", title, make_element("main", content), connects=True)
+
+
+def _make_runs_form(listed: Sequence[tuple[str, listing.ListedRun]]) -> Html:
+    """Return the table of runs, in which sweeps can be chosen for a comparison.
+
+    Args:
+        listed: the runs with their names.
+    """
     # a single sweep has nothing to be compared with
     can_compare = sum(run.command == "sweep" for _, run in listed) > 1
     button = None
     if can_compare:
         text = "Show the chosen sweeps side by side"
         button = make_element("p", make_element("button", text, type="submit"))
-    if not listed:
-        content = make_element(
-            "p", "No runs here yet: advsearch sweep, or advsearch attack, makes one."
-        )
-    else:
-        table = make_scrollable(_runs_table(listed, can_compare))
-        content = make_element("form", table, button, action="compare/")
-    title = make_element("header", make_element("h1", "Runs"))
-    return make_document("Runs", title, make_element("main", content), connects=True)
+    table = make_scrollable(_runs_table(listed, can_compare))
+    return make_element("form", table, button, action="compare/")
 
 
 def _runs_table(
@@ -143,22 +152,17 @@ def _run_row(name: str, run: listing.ListedRun, can_compare: bool) -> Html:
     if can_compare:
         checkbox = _comparison_checkbox(name) if run.command == "sweep" else None
         cells.append(make_element("td", checkbox))
-    cells.append(make_element("td", _cover_link(run, address)))
-    cells.append(
-        make_element(
-            "th",
-            make_element("a", name, href=address),
-            _run_subject(name, run, address),
-            scope="row",
-        )
-    )
+    link = make_element("a", name, href=address)
+    subject = _run_subject(name, run, address)
     outcome = join_html(run.state, f": {run.outcome}" if run.outcome else None)
     fault = make_element("div", run.fault, class_="remarks") if run.fault else None
-    cells.append(make_element("td", outcome, fault))
-    start = ""
-    if run.when is not None:
-        start = time.strftime("%Y-%m-%d %H:%M", time.localtime(run.when))
-    cells.append(make_element("td", start, class_="number"))
+    start = _format_start_time(run.when)
+    cells += [
+        make_element("td", _cover_link(run, address)),
+        make_element("th", link, subject, scope="row"),
+        make_element("td", outcome, fault),
+        make_element("td", start, class_="number"),
+    ]
     return make_element("tr", *cells)
 
 
@@ -221,6 +225,17 @@ def is_unfinished(run: Path) -> bool:
     return not (run / REPORT).is_file() or (is_held(run) and listing.can_resume(run))
 
 
+def _format_start_time(when: float | None) -> str:
+    """Return when a run was started, in local time; "" if that is unknown.
+
+    Args:
+        when: seconds since 1970.
+    """
+    if when is None:
+        return ""
+    return time.strftime("%Y-%m-%d %H:%M", time.localtime(when))
+
+
 def make_progress_page(name: str, run: Path) -> str:
     """Return the page that follows the progress of a run.
 
@@ -232,35 +247,33 @@ def make_progress_page(name: str, run: Path) -> str:
         run: directory of the run.
     """
     listed = listing.read_listed_run(run)
-    subjects = (listed.command, listed.object, " and ".join(listed.controls))
-    if listed.state == "running":
-        state = "A process is working on it."
-    else:
-        state = f"It was stopped: advsearch resume {name} goes on."
-    counts = [f"{count} of {kind}" for kind, count in listed.kinds.items()]
-    header = make_element(
-        "header",
-        make_element("p", ", ".join(filter(None, subjects)), class_="eyebrow"),
-        make_element("h1", f"{name} has not ended"),
-    )
     # The script requests rows after a row from this address, relative to the page.
     request = {"progress": "progress", "start": FIRST_ROW_ID}
-    state_text = f"{state} Evaluations so far: {', '.join(counts) or 'none'}."
     main = make_element(
         "main",
-        make_element("p", state_text, id="state"),
+        make_element("p", _describe_state(name, listed), id="state"),
         make_element("div", id="follow"),  # filled by the script follow.js
         _attack_list_html(run),
     )
     return make_document(
         name,
-        header,
+        _make_progress_header(name, listed),
         main,
         data=[make_data_script(request, "run")],
         scripts=["make.js", "follow.js"],
         connects=True,
         footer=f"run {name}",
     )
+
+
+def _describe_state(name: str, run: listing.ListedRun) -> str:
+    """Return whether a run is running, and its evaluations so far, as sentences."""
+    if run.state == "running":
+        state = "A process is working on it."
+    else:
+        state = f"It was stopped: advsearch resume {name} goes on."
+    counts = [f"{count} of {kind}" for kind, count in run.kinds.items()]
+    return f"{state} Evaluations so far: {', '.join(counts) or 'none'}."
 
 
 def _attack_list_html(run: Path) -> Html | None:
@@ -281,6 +294,21 @@ def _attack_list_html(run: Path) -> Html | None:
     )
 
 
+def _make_progress_header(name: str, run: listing.ListedRun) -> Html:
+    """Return the header of the page that follows the progress of a run.
+
+    Args:
+        name: name of the run in the dashboard.
+        run: state of the run.
+    """
+    subjects = (run.command, run.object, " and ".join(run.controls))
+    return make_element(
+        "header",
+        make_element("p", ", ".join(filter(None, subjects)), class_="eyebrow"),
+        make_element("h1", f"{name} has not ended"),
+    )
+
+
 def make_progress_json(run: Path, after: int) -> bytes:
     """Return the progress of a run as JSON: new rows and images, and whether it runs.
 
@@ -295,20 +323,7 @@ def make_progress_json(run: Path, after: int) -> bytes:
     # running, so that the page requests its last rows once more.
     running = is_held(run)  # a process works on it
     ended = not is_unfinished(run)  # it has its final page
-    last_id = after
-    rows = list[dict[str, object]]()
-    pictures = list[dict[str, object]]()
-    if (run / store.NAME).is_file():
-        with store.Store(run / store.NAME, read_only=True) as results:
-            for row in islice(results.rows(after=after), MAX_PROGRESS_ROWS):
-                rows.append(_row_json(row))
-                last_id = row.id or after  # stored rows have an id
-            # Only images of the search, since the page displays no others. The index of
-            # an evaluation in its search is its step.
-            for step, picture in results.iterate_images("search", after, last_id):
-                jpeg = make_thumbnail(picture.astype("float32") / 255.0)
-                url = make_data_url(jpeg, "image/jpeg")
-                pictures.append({"step": step, "picture": url})
+    rows, pictures, last_id = _read_new_rows(run, after)
     progress = {
         "rows": rows,
         "pictures": pictures,
@@ -317,6 +332,46 @@ def make_progress_json(run: Path, after: int) -> bytes:
         "ended": ended,
     }
     return json.dumps(to_json_value(progress), allow_nan=False).encode()
+
+
+def _read_new_rows(
+    run: Path, after: int
+) -> tuple[list[dict[str, object]], list[dict[str, object]], int]:
+    """Return new rows of a run and new images of its search, and the id of the last row.
+
+    Args:
+        run: directory of the run.
+        after: id of the row after which to begin.
+    """
+    if not (run / store.NAME).is_file():
+        return [], [], after
+    last_id = after
+    rows = list[dict[str, object]]()
+    with store.Store(run / store.NAME, read_only=True) as results:
+        for row in islice(results.rows(after=after), MAX_PROGRESS_ROWS):
+            rows.append(_row_json(row))
+            last_id = row.id or after  # stored rows have an id
+        pictures = _list_search_pictures(results, after, last_id)
+    return rows, pictures, last_id
+
+
+def _list_search_pictures(
+    results: store.Store, after: int, last_id: int
+) -> list[dict[str, object]]:
+    """Return the step and the data URL of each image of a search.
+
+    Args:
+        results: stored results of the run.
+        after: id of the row after which the images begin.
+        last_id: id of the last row.
+    """
+    pictures = list[dict[str, object]]()
+    # Only images of the search, since the page displays no others. The index of an
+    # evaluation in its search is its step.
+    for step, picture in results.iterate_images("search", after, last_id):
+        jpeg = make_thumbnail(picture.astype("float32") / 255.0)
+        pictures.append({"step": step, "picture": make_data_url(jpeg, "image/jpeg")})
+    return pictures
 
 
 def _row_json(row: store.Row) -> dict[str, object]:
@@ -454,13 +509,20 @@ class Dashboard(HTTPServer):
         self.fingerprint = None
         self._context: ssl.SSLContext | None = None
         if https or self.token:
-            self._context, self.fingerprint = make_https_context(
-                (find_reachable_address(host), "localhost", LOOPBACK)
-            )
+            names = (find_reachable_address(host), "localhost", LOOPBACK)
+            self._context, self.fingerprint = make_https_context(names)
         # The socket is bound below, where an error about the address is converted.
         super().__init__((host, port), _Handler, bind_and_activate=False)
         # `finish_request` is the method of `socketserver` that calls `_Handler`.
         self.clients = ConnectionPool(self.socket, self.finish_request, self._context)
+        self._listen(host, port)
+
+    def _listen(self, host: str, port: int) -> None:
+        """Bind the socket to an address, and listen there.
+
+        Raises:
+            InputError: the address cannot be used.
+        """
         try:
             self.server_bind()
             self.server_activate()
@@ -592,19 +654,23 @@ class _Handler(BaseHTTPRequestHandler):
             status, text = _describe_error(error)
             data = f"{text}\n".encode("utf-8", "replace")
             response = Response("text/plain; charset=utf-8", data)
+        self._send_reply(status, response, headers)
+
+    def _send_reply(
+        self, status: HTTPStatus, response: Response, headers: Mapping[str, str]
+    ) -> None:
+        """Send a response to the client; to a HEAD request without its content.
+
+        Args:
+            status: HTTP status.
+            response: content of the response.
+            headers: headers in addition to those of all responses.
+        """
         self.send_response(status)
-        for name, value in {
-            "Content-Type": response.media_type,
-            "Content-Length": str(len(response.data)),
-            "Content-Security-Policy": response.policy,
-            "Cache-Control": "no-store",
-            **CLOSED,
-            **headers,
-        }.items():
+        for name, value in {**_make_common_headers(response), **headers}.items():
             self.send_header(name, value)
-        self.server.clients.report_waiting(
-            REQUEST_SECONDS + len(response.data) / MIN_BYTES_PER_SECOND
-        )
+        seconds_to_send = len(response.data) / MIN_BYTES_PER_SECOND
+        self.server.clients.report_waiting(REQUEST_SECONDS + seconds_to_send)
         self.end_headers()
         if self.command != "HEAD":
             self.wfile.write(response.data)
@@ -685,10 +751,7 @@ class _Handler(BaseHTTPRequestHandler):
             case ["runs", name, "rows"]:
                 return self._serve_rows(query, server.find_run(name))
             case ["runs", name, "progress"]:
-                progress = make_progress_json(
-                    server.find_run(name), _parse_after(query)
-                )
-                return Response("application/json", progress)
+                return self._serve_progress(query, server.find_run(name))
             # the page of a part of a study, to which the study's page links
             case ["runs", name, directory.PARTS, part, directory.REPORT]:
                 return self._serve_part(name, part)
@@ -696,19 +759,43 @@ class _Handler(BaseHTTPRequestHandler):
             case ["runs", name, "pictures", folder, file] if THUMBNAIL_PATH.fullmatch(
                 f"{folder}/{file}"
             ):
-                number = int(file.removesuffix(".jpg"))
-                return Response(
-                    "image/jpeg", read_thumbnail(server.find_run(name), number)
-                )
+                return self._serve_thumbnail(name, file)
             case ["runs", name, "align", ""]:
                 return self._serve_photograph_page(name)
             case ["runs", name, "align", ("renderings" | "photos") as folder, file]:
-                kind = folder.removesuffix("s")
-                media_type, data = server.photograph_pages.read_picture(
-                    kind, server.find_run(name), file
-                )
-                return Response(media_type, data)
+                return self._serve_photograph(name, folder.removesuffix("s"), file)
         raise RequestRejected(HTTPStatus.NOT_FOUND, "there is no such page")
+
+    def _serve_progress(self, query: Query, run: Path) -> Response:
+        """Serve the progress of a run since a row that the query names, as JSON."""
+        progress = make_progress_json(run, _parse_after(query))
+        return Response("application/json", progress)
+
+    def _serve_thumbnail(self, name: str, file: str) -> Response:
+        """Serve a small image of a run.
+
+        Args:
+            name: name of the run.
+            file: name of the file, such as "1234.jpg", which has the image's number.
+        """
+        number = int(file.removesuffix(".jpg"))
+        return Response(
+            "image/jpeg", read_thumbnail(self.server.find_run(name), number)
+        )
+
+    def _serve_photograph(self, name: str, kind: str, file: str) -> Response:
+        """Serve a picture for the page that aligns photographs.
+
+        Args:
+            name: name of the run.
+            kind: "rendering" or "photo".
+            file: name of the file.
+        """
+        server = self.server
+        media_type, data = server.photograph_pages.read_picture(
+            kind, server.find_run(name), file
+        )
+        return Response(media_type, data)
 
     def _serve_run(self, name: str) -> Response:
         """Return the page of a run by its name.
@@ -754,26 +841,13 @@ class _Handler(BaseHTTPRequestHandler):
         """Return a page of several sweeps side by side."""
         names = dict.fromkeys(query.get("run", []))  # each name once
         runs = [(name, self.server.find_run(name)) for name in names]
-        if not runs:
-            raise RequestRejected(HTTPStatus.BAD_REQUEST, "choose at least one sweep")
-        other_commands = [
-            name
-            for name, run in runs
-            if listing.read_listed_run(run, counts=False).command != "sweep"
-        ]
-        if other_commands:
-            raise RequestRejected(
-                HTTPStatus.BAD_REQUEST,
-                "only sweeps can be shown side by side; "
-                f"{', '.join(other_commands)} is none",
-            )
+        _check_comparable(runs)
         sources = [
             _make_source(name, run, f"../runs/{quote_name(name)}/")
             for name, run in runs
         ]
-        page = make_sweep_page(
-            [(run, load_sweep_result(run)) for _, run in runs], sources
-        )
+        results = [(run, load_sweep_result(run)) for _, run in runs]
+        page = make_sweep_page(results, sources)
         return _serve_page(page, home="../")  # from compare/
 
     def _serve_rows(self, query: Query, run: Path) -> Response:
@@ -819,6 +893,41 @@ class _Handler(BaseHTTPRequestHandler):
         if len(data) < int(length):
             raise RequestRejected(HTTPStatus.BAD_REQUEST, "a part of it did not come")
         return data
+
+
+def _check_comparable(runs: Sequence[tuple[str, Path]]) -> None:
+    """Check that there are runs, and that all of them are sweeps.
+
+    Args:
+        runs: the runs with their names.
+
+    Raises:
+        RequestRejected: there is none, or one is no sweep.
+    """
+    if not runs:
+        raise RequestRejected(HTTPStatus.BAD_REQUEST, "choose at least one sweep")
+    other_commands = [
+        name
+        for name, run in runs
+        if listing.read_listed_run(run, counts=False).command != "sweep"
+    ]
+    if other_commands:
+        raise RequestRejected(
+            HTTPStatus.BAD_REQUEST,
+            "only sweeps can be shown side by side; "
+            f"{', '.join(other_commands)} is none",
+        )
+
+
+def _make_common_headers(response: Response) -> dict[str, str]:
+    """Return the headers that every response has."""
+    return {
+        "Content-Type": response.media_type,
+        "Content-Length": str(len(response.data)),
+        "Content-Security-Policy": response.policy,
+        "Cache-Control": "no-store",
+        **CLOSED,
+    }
 
 
 def _parse_after(query: Query) -> int:

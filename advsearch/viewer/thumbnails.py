@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from PIL import Image
@@ -154,16 +154,13 @@ class Thumbnails:
             data = read_thumbnail(self.run, step // self.rows_per_image)
         except OSError:
             return None
-        stream = io.BytesIO()
         try:
-            with Image.open(io.BytesIO(data), formats=("JPEG",)) as image:
-                image.save(stream, "PNG")
+            return _convert_to_png(data)
         except BAD_PICTURE:
             file = thumbnail_path(self.run, step // self.rows_per_image)
             raise FileFormatError(
                 f"{file}: expected a small picture of the run, got something else"
             ) from None
-        return stream.getvalue()
 
     def list_data_urls(
         self, rows: pd.DataFrame, max_bytes: int
@@ -174,13 +171,9 @@ class Thumbnails:
             rows: table with the "step" and the "margin" of rows.
             max_bytes: maximum size of all URLs together.
         """
-        steps = rows["step"].to_numpy()
-        margins = rows["margin"].to_numpy()
-        # rows without a margin come last
-        order = np.argsort(np.nan_to_num(margins, nan=np.inf), kind="stable")
         remaining = set(self.numbers)
         n_bytes = 0
-        for step in steps[order]:
+        for step in _sort_by_margin(rows):
             number = int(step) // self.rows_per_image
             if number not in remaining:
                 continue
@@ -194,6 +187,15 @@ class Thumbnails:
             yield str(number), f"data:image/jpeg;base64,{text}"
 
 
+def _sort_by_margin(rows: pd.DataFrame) -> Any:
+    """Return the steps of rows, the worst margins first."""
+    steps = rows["step"].to_numpy()
+    margins = rows["margin"].to_numpy()
+    # rows without a margin come last
+    order = np.argsort(np.nan_to_num(margins, nan=np.inf), kind="stable")
+    return steps[order]
+
+
 def find_thumbnails(run: Path) -> Thumbnails | None:
     """Return the thumbnails of a sweep, None if it has none."""
     has_thumbnails = next(_list_numbers(run), None) is not None
@@ -204,6 +206,18 @@ def find_thumbnails(run: Path) -> Thumbnails | None:
     model_names = split_names(str(settings.get("model", "default")))
     is_subset = settings.get("keep_pictures") != "all"
     return Thumbnails(run, len(model_names), is_subset)
+
+
+def _convert_to_png(jpeg: bytes) -> bytes:
+    """Return a JPEG image as a PNG.
+
+    Raises:
+        Exception: one of `BAD_PICTURE` if it is no JPEG.
+    """
+    stream = io.BytesIO()
+    with Image.open(io.BytesIO(jpeg), formats=("JPEG",)) as image:
+        image.save(stream, "PNG")
+    return stream.getvalue()
 
 
 def _list_numbers(run: Path) -> Iterator[int]:

@@ -46,18 +46,7 @@ def write_threedb(
         InputError: there are no rows, or the folder is not empty.
     """
     writing.check_free_folder(out, "out")
-    # the parameters in the order in which rows have them; a dict is an ordered set
-    names = dict[str, None]()
-    # index of each predicted label; None where the model has no index for it
-    index_of_label = dict[str, int | None]()
-    for row in iterate_rows():
-        names |= dict.fromkeys(
-            name for name in row.values if name not in SEPARATE_VALUES
-        )
-        index_of_label.setdefault(_get_label(row), row.label_index)
-    if not index_of_label:
-        raise InputError("format 3db: needs the rows of a sweep, and this run has none")
-    class_index = _complete_indices(index_of_label)
+    names, class_index = _collect_names(iterate_rows())
     n_rows = 0
     with writing.name_setting_in_errors("out"):
         with (
@@ -67,14 +56,41 @@ def write_threedb(
             for row in iterate_rows():
                 line = make_line(row, names, class_index[_get_label(row)])
                 file.write(json.dumps(line, allow_nan=False) + "\n")
-                png = read_picture(row.step)
-                if png is not None:
-                    image_path = out / IMAGES / f"{line['id']}_rgb.png"
-                    writing.write_bytes(image_path, png, durable=False)
+                _write_picture(out, line["id"], read_picture(row.step))
                 n_rows += 1
         class_names = _list_class_names(class_index)
         writing.write_text(out / CLASSES, json.dumps(class_names))
     return n_rows
+
+
+def _collect_names(rows: Iterable[Any]) -> tuple[list[str], dict[str, int]]:
+    """Return the names of the parameters of rows, and the index of each label.
+
+    Args:
+        rows: rows of a sweep.
+
+    Raises:
+        InputError: there are no rows.
+    """
+    # the parameters in the order in which rows have them; a dict is an ordered set
+    names = dict[str, None]()
+    # index of each predicted label; None where the model has no index for it
+    index_of_label = dict[str, int | None]()
+    for row in rows:
+        names |= dict.fromkeys(
+            name for name in row.values if name not in SEPARATE_VALUES
+        )
+        index_of_label.setdefault(_get_label(row), row.label_index)
+    if not index_of_label:
+        raise InputError("format 3db: needs the rows of a sweep, and this run has none")
+    return list(names), _complete_indices(index_of_label)
+
+
+def _write_picture(out: Path, line_id: str, png: bytes | None) -> None:
+    """Write the picture of a line into the folder of 3DB; None if it has none."""
+    if png is not None:
+        image_path = out / IMAGES / f"{line_id}_rgb.png"
+        writing.write_bytes(image_path, png, durable=False)
 
 
 def _get_label(row: Any) -> str:
@@ -118,13 +134,14 @@ def make_line(row: Any, names: Iterable[str], prediction: int) -> dict[str, Any]
         "network" if name == "model" else name: value_of.get(name, "none")
         for name in names
     }
+    # 0.0 minus the margin: the negative of 0.0 would be written as -0.0
+    loss = None if row.margin is None else 0.0 - row.margin
     return {
         "id": f"{row.step}",
         "environment": str(value_of.get("environment", "none")),
         "model": str(value_of.get("object", "none")),
         "is_correct": str(bool(row.correct)),
-        # 0.0 minus the margin: the negative of 0.0 would be written as -0.0
-        "loss": None if row.margin is None else 0.0 - row.margin,
+        "loss": loss,
         "prediction": [prediction],
         "output_type": "classes",
         "render_args": parameters,
@@ -159,12 +176,9 @@ class ThreeDB(Exporter):
 
         run_path = directory.find_run(run)
         thumbnails = exports.thumbnails.find_thumbnails(run_path)
+        read_picture = thumbnails.read_png if thumbnails else _read_no_picture
+        kind = options["kind"] or "sweep"
         with Store(run_path / Store.FILE, read_only=True) as store:
-            read_picture = thumbnails.read_png if thumbnails else _read_no_picture
-            n_rows = write_threedb(
-                lambda: store.rows(options["kind"] or "sweep"), out, read_picture
-            )
-        return Exported(
-            {"rows": n_rows},
-            f"{n_rows} rows in {out}; look at them with: python -m threedboard {out}",
-        )
+            n_rows = write_threedb(lambda: store.rows(kind), out, read_picture)
+        text = f"{n_rows} rows in {out}; look at them with: python -m threedboard {out}"
+        return Exported({"rows": n_rows}, text)

@@ -29,18 +29,17 @@ class _Dataset(Exporter):
         """
         from advsearch.cli.exporters.dataset.files import write_dataset  # takes seconds
 
+        every = bool(options["all"])
         count, notes = write_dataset(
-            run, out, self.name, every=bool(options["all"]), progress=progress
+            run, out, self.name, every=every, progress=progress
         )
         if not count:
             raise InputError(
                 f"{run}: no model is wrong in a picture of its rows; "
                 "--all takes the others too"
             )
-        return Exported(
-            {"pictures": count, "notes": notes},
-            " ".join([f"{count} pictures in {out}.", *notes]),
-        )
+        text = " ".join([f"{count} pictures in {out}.", *notes])
+        return Exported({"pictures": count, "notes": notes}, text)
 
 
 class Coco(_Dataset):

@@ -70,11 +70,17 @@ class Categories:
                 "them; export one of its parts"
             )
         self.labels = labels
+        return self._find_categories(image, object_category)
+
+    def _find_categories(
+        self, image: Any, object_category: int
+    ) -> list[tuple[Any, int]]:
+        """Return the things of an image that have a category, each with its index."""
         things = []
         for thing in image.list_things():
             category: int | None = object_category
             if thing.name != OBJECT:
-                category = _find_category(image.get_label(thing), labels)
+                category = _find_category(image.get_label(thing), self.labels)
             if category is None:
                 self.unnamed.add(thing.name)
             else:
@@ -141,11 +147,8 @@ def write_dataset(
     directory.find_run(run)  # raises if there is none, before anything is written
     categories = Categories()
     with writing.name_setting_in_errors("out"):
-        with writing.storage_errors(out):
-            out.parent.mkdir(parents=True, exist_ok=True)
-            temporary = tempfile.TemporaryDirectory(prefix=".export-", dir=out.parent)
-        with temporary:
-            folder = Path(temporary.name) / "dataset"
+        with _make_temporary_folder(out) as temporary:
+            folder = Path(temporary) / "dataset"
             rendered = exports.render_rows(run, every=every, progress=progress)
             n_images, n_changed = _write_files(folder, rendered, categories, format)
             if not n_images:
@@ -154,6 +157,20 @@ def write_dataset(
             with writing.storage_errors(out):
                 os.replace(folder, out)
     return n_images, make_notes(categories, n_changed)
+
+
+def _make_temporary_folder(out: Path) -> tempfile.TemporaryDirectory[str]:
+    """Make a temporary folder next to a dataset, and return its context manager.
+
+    Args:
+        out: folder of the dataset, whose parent is made if it is missing.
+
+    Raises:
+        StorageError: a folder cannot be made.
+    """
+    with writing.storage_errors(out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        return tempfile.TemporaryDirectory(prefix=".export-", dir=out.parent)
 
 
 def _write_files(
@@ -176,21 +193,29 @@ def _write_files(
     n_changed = 0
     for image_id, image in enumerate(rendered, 1):
         things = categories.find_things(image)
-        path = folder / IMAGES / f"{image.name}.png"
-        Exporter.write_png(path, image.picture.numpy())
+        _write_dataset_image(folder, image)
         images.append(make_image(image_id, image))
-        next_annotation_id = len(annotations) + 1
-        annotations += make_things(next_annotation_id, image_id, things)
-        if not image.is_reproduced:
-            n_changed += 1
+        annotations += make_things(len(annotations) + 1, image_id, things)
+        n_changed += int(not image.is_reproduced)
         if format == "yolo":
-            labels = make_yolo_labels(image, things)
-            writing.write_text(folder / LABELS / f"{image.name}.txt", labels)
+            _write_yolo_labels(folder, image, things)
     if images and format == "yolo":
         write_yolo_index(folder, categories)
     elif images:
         write_coco_index(folder, categories, images, annotations)
     return len(images), n_changed
+
+
+def _write_dataset_image(folder: Path, image: Any) -> None:
+    """Write a rendered image as PNG into the folder of a dataset."""
+    path = folder / IMAGES / f"{image.name}.png"
+    Exporter.write_png(path, image.picture.numpy())
+
+
+def _write_yolo_labels(folder: Path, image: Any, things: list[tuple[Any, int]]) -> None:
+    """Write the file of a YOLO dataset with the labels of an image."""
+    labels = make_yolo_labels(image, things)
+    writing.write_text(folder / LABELS / f"{image.name}.txt", labels)
 
 
 def make_yolo_labels(image: Any, things: list[tuple[Any, int]]) -> str:
@@ -203,19 +228,30 @@ def make_yolo_labels(image: Any, things: list[tuple[Any, int]]) -> str:
         image: the image.
         things: the things that it shows, each with the index of its category.
     """
-    image_height, image_width = image.picture.shape[:2]
     lines = []
     for thing, category in things:
-        left, top, width, height = find_box(thing)
-        center_and_size = (
-            (left + width / 2) / image_width,
-            (top + height / 2) / image_height,
-            width / image_width,
-            height / image_height,
+        numbers = " ".join(
+            f"{value:.6f}" for value in _compute_center_and_size(image, thing)
         )
-        numbers = " ".join(f"{value:.6f}" for value in center_and_size)
         lines.append(f"{category} {numbers}\n")
     return "".join(lines)
+
+
+def _compute_center_and_size(
+    image: Any, thing: Any
+) -> tuple[float, float, float, float]:
+    """Return X and Y of a box's center, and its width and height.
+
+    All are fractions of the picture, as YOLO has them.
+    """
+    image_height, image_width = image.picture.shape[:2]
+    left, top, width, height = find_box(thing)
+    return (
+        (left + width / 2) / image_width,
+        (top + height / 2) / image_height,
+        width / image_width,
+        height / image_height,
+    )
 
 
 def write_yolo_index(folder: Path, categories: Categories) -> None:
@@ -246,11 +282,6 @@ def write_coco_index(
         images: entries of the images.
         annotations: entries of the things in all images.
     """
-    category_entries = [
-        {"id": index, "name": name, "supercategory": ""}
-        for index, name in enumerate(categories.labels)
-        if not models.is_nothing_name(name)
-    ]
     dataset: dict[str, Any] = {
         "info": {
             "description": "pictures of advsearch",
@@ -259,9 +290,18 @@ def write_coco_index(
         "licenses": [],
         "images": images,
         "annotations": annotations,
-        "categories": category_entries,
+        "categories": _make_category_entries(categories),
     }
     writing.write_text(folder / COCO, json.dumps(dataset, allow_nan=False))
+
+
+def _make_category_entries(categories: Categories) -> list[dict[str, Any]]:
+    """Return the entries of the categories in COCO's JSON."""
+    return [
+        {"id": index, "name": name, "supercategory": ""}
+        for index, name in enumerate(categories.labels)
+        if not models.is_nothing_name(name)
+    ]
 
 
 def make_notes(categories: Categories, n_changed: int) -> list[str]:
@@ -297,21 +337,25 @@ def make_image(image_id: int, image: Any) -> dict[str, Any]:
         image: the rendered image, with the rows that store its predictions.
     """
     height, width = image.picture.shape[:2]
-    predictions = [_describe_prediction(row) for row in image.rows]
-    configuration = {
-        name: dict(entry) for name, entry in image.values.items() if name != "model"
-    }
-    extras: dict[str, Any] = {
-        "right": all(row.correct for row in image.rows),
-        "answers": predictions,
-        "configuration": configuration,
-    }
     return {
         "id": image_id,
         "file_name": f"{image.name}.png",
         "height": height,
         "width": width,
-        "advsearch": extras,
+        "advsearch": _describe_image(image),
+    }
+
+
+def _describe_image(image: Any) -> dict[str, Any]:
+    """Return the predictions for an image and the values of its parameters."""
+    predictions = [_describe_prediction(row) for row in image.rows]
+    configuration = {
+        name: dict(entry) for name, entry in image.values.items() if name != "model"
+    }
+    return {
+        "right": all(row.correct for row in image.rows),
+        "answers": predictions,
+        "configuration": configuration,
     }
 
 
@@ -371,16 +415,18 @@ def make_thing(
         "category_id": category,
         "bbox": [*find_box(thing)],
         "area": int(thing.mask.sum()),
-        "segmentation": {
-            "size": [*thing.mask.shape],
-            "counts": [*find_runs(thing.mask)],
-        },
+        "segmentation": _encode_mask(thing.mask),
         "iscrowd": 0,
         "visible_share": None if fraction is None else round(fraction, 4),
         "truncated": thing.is_truncated,
         "name": thing.name,
         "distance": round(thing.distance, 4),
     }
+
+
+def _encode_mask(mask: NDArray[np.bool_]) -> dict[str, list[int]]:
+    """Return a mask (H, W) as COCO's JSON has it, run-length encoded."""
+    return {"size": [*mask.shape], "counts": [*find_runs(mask)]}
 
 
 def find_runs(mask: NDArray[np.bool_]) -> list[int]:

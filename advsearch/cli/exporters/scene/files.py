@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -48,37 +48,70 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
     backdrop = image_inputs.get("backdrop.color")
     hazy = has_haze(renderer, scene_inputs)
     _check_backdrop(backdrop, adversarial.folder, hazy=hazy)  # raises for photographs
-    # factor from radiance to the value that the sRGB curve takes
-    gain = renderer.formation.gain
-    if "camera.exposure" in image_inputs:
-        # the exposure is in stops, each of which doubles the light
-        gain *= float(torch.exp2(image_inputs["camera.exposure"]))
+    gain = _compute_exposed_gain(renderer, image_inputs)
     notes = [
         *describe_formation(renderer, gain, backdrop),
         *describe_omissions(adversarial, hazy=hazy),
     ]
     with writing.name_setting_in_errors("out"), writing.storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".export-", dir=path.parent) as folder:
-            mitsuba_data.write_scene(
-                renderer.scene,
-                scene_inputs,
-                Path(folder) / path.name,
-                " ".join(notes),
-                hide_environment=backdrop is not None,
-            )
-            # Moved when all files are written: so an error leaves none of them.
-            for file in sorted(Path(folder).iterdir()):
-                os.replace(file, path.parent / file.name)
-        title = (
-            f"The adversarial scene of {adversarial.folder.name} as a scene for "
-            "Mitsuba 3"
+        _write_scene_files(
+            path,
+            renderer.scene,
+            scene_inputs,
+            notes,
+            hide_environment=backdrop is not None,
         )
-        text = [f"{title} (advsearch {advsearch.__version__}).\n", *notes, ""]
-        writing.write_text(
-            path.with_name(f"{path.stem}-README.txt"), "\n".join(text), durable=False
-        )
+        _write_scene_readme(path, adversarial.folder.name, notes)
     return notes
+
+
+def _compute_exposed_gain(renderer: Any, image_inputs: Mapping[str, Any]) -> Any:
+    """Return the factor from radiance to the value that the sRGB curve takes."""
+    gain = renderer.formation.gain
+    if "camera.exposure" in image_inputs:
+        # the exposure is in stops, each of which doubles the light
+        gain *= float(torch.exp2(image_inputs["camera.exposure"]))
+    return gain
+
+
+def _write_scene_files(
+    path: Path,
+    scene: Any,
+    scene_inputs: Mapping[str, Any],
+    notes: Sequence[str],
+    *,
+    hide_environment: bool,
+) -> None:
+    """Write the XML of a scene with its meshes and pictures: all files, or none.
+
+    Args:
+        path: the XML file; its folder exists.
+        scene: the scene of a renderer.
+        scene_inputs: values of its inputs.
+        notes: sentences for a comment in the file.
+        hide_environment: whether the environment is invisible to the camera.
+    """
+    with tempfile.TemporaryDirectory(prefix=".export-", dir=path.parent) as folder:
+        mitsuba_data.write_scene(
+            scene,
+            scene_inputs,
+            Path(folder) / path.name,
+            " ".join(notes),
+            hide_environment=hide_environment,
+        )
+        # Moved when all files are written: so an error leaves none of them.
+        for file in sorted(Path(folder).iterdir()):
+            os.replace(file, path.parent / file.name)
+
+
+def _write_scene_readme(path: Path, run_name: str, notes: Sequence[str]) -> None:
+    """Write the notes about a scene as a text next to its XML file."""
+    title = f"The adversarial scene of {run_name} as a scene for Mitsuba 3"
+    text = [f"{title} (advsearch {advsearch.__version__}).\n", *notes, ""]
+    writing.write_text(
+        path.with_name(f"{path.stem}-README.txt"), "\n".join(text), durable=False
+    )
 
 
 def _check_backdrop(backdrop: torch.Tensor | None, folder: Path, *, hazy: bool) -> None:
@@ -160,12 +193,17 @@ def describe_formation(renderer: Any, gain: float, backdrop: Any) -> list[str]:
     if backdrop is not None:
         # The color is added to the radiance, before the gain.
         channels = (backdrop / renderer.formation.gain).tolist()
-        red, green, blue = (f"{channel:.9g}" for channel in channels)
-        notes.append(
-            "Before that, add (1 - alpha) times the plain background "
-            f"({red}, {green}, {blue}) to each pixel of the radiance."
-        )
+        notes.append(_describe_backdrop(channels))
     return notes
+
+
+def _describe_backdrop(channels: Sequence[float]) -> str:
+    """Return a sentence about the radiance (red, green, blue) of a plain background."""
+    red, green, blue = (f"{channel:.9g}" for channel in channels)
+    return (
+        "Before that, add (1 - alpha) times the plain background "
+        f"({red}, {green}, {blue}) to each pixel of the radiance."
+    )
 
 
 def describe_omissions(adversarial: Any, *, hazy: bool) -> list[str]:
@@ -219,20 +257,35 @@ def write_gltf(run: str | Path, out: Path) -> list[str]:
     metres = None if description is None else description.object.size_in_metres
     if metres is not None:
         # lengths of our scenes are in object sizes, those of glTF in metres
-        posed_mesh = posed_asset.mesh
-        vertices = posed_mesh.vertices * np.float32(metres)
-        posed_asset = replace(posed_asset, mesh=replace(posed_mesh, vertices=vertices))
+        posed_asset = _scale_mesh(posed_asset, metres)
     with writing.name_setting_in_errors("out"):
         writing.write_bytes(out, reading.encode_glb([posed_asset]))
     unit = "object sizes" if metres is None else "metres"
     notes = [f"Lengths are in {unit}, y is up, and the texture is rounded to 8 bits."]
-    if described_object.surface is not None:
-        notes.append(
-            "The object has a BSDF of Mitsuba. Of it, the file has the base color only."
-        )
-    elif posed_asset.material.specular > reading.DEFAULT_SPECULAR:
-        notes.append(
-            f"The object has a specular of {posed_asset.material.specular:g}. The "
-            f"file has {reading.DEFAULT_SPECULAR:g}, the maximum of glTF."
-        )
+    notes += _describe_lost_material(described_object, posed_asset)
     return notes
+
+
+def _scale_mesh(asset: Any, factor: float) -> Any:
+    """Return an asset whose mesh is larger by a factor."""
+    vertices = asset.mesh.vertices * np.float32(factor)
+    return replace(asset, mesh=replace(asset.mesh, vertices=vertices))
+
+
+def _describe_lost_material(described_object: Any, asset: Any) -> list[str]:
+    """Return sentences about what glTF does not have of an object's material.
+
+    Args:
+        described_object: the object as the scene describes it.
+        asset: the object with its material.
+    """
+    if described_object.surface is not None:
+        return [
+            "The object has a BSDF of Mitsuba. Of it, the file has the base color only."
+        ]
+    if asset.material.specular > reading.DEFAULT_SPECULAR:
+        return [
+            f"The object has a specular of {asset.material.specular:g}. The "
+            f"file has {reading.DEFAULT_SPECULAR:g}, the maximum of glTF."
+        ]
+    return []
