@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from itertools import product
@@ -32,6 +32,21 @@ CONFIGS: Mapping[str, type[SceneConfig]] = {
 PHOTOGRAPHS = "photographs"
 COMMAND_SETTINGS = (*settings.RUN_LOCATION, "seed", "threads", "deterministic")
 """Settings that are given with the command and not in the file of a recipe."""
+# settings of a recipe that those of the command replace
+REPLACED_SETTINGS = (
+    "object",
+    "environment",
+    "model",
+    "labels",
+    "prompt",
+    "value_range",
+    "task",
+    "up",
+    "facing",
+    "size",
+    "unit",
+    "resolution",
+)
 
 MAX_PARTS = 64
 MAX_FIGURES = 32
@@ -127,15 +142,7 @@ class Recipe(_Described):
         """Check the names of parts, and that parts refer to earlier ones only."""
         earlier = list[str]()
         for name, part in value.items():
-            if not re.fullmatch(r"[a-z0-9][a-z0-9-]{0,39}", name):
-                raise ValueError(
-                    "expected names of small letters, digits and "
-                    f"hyphens, got {name[:40]!r}"
-                )
-            if name == PHOTOGRAPHS:
-                raise ValueError(
-                    f"expected another name than {name!r}, which photographs have"
-                )
+            _check_part_name(name)
             for key, other in (("around", part.around), ("drawn_as", part.drawn_as)):
                 if other is not None and other not in earlier:
                     raise ValueError(
@@ -155,19 +162,30 @@ class Recipe(_Described):
                 raise errors.UnknownNameError(
                     "part", name, self.parts, "It stands under `quick` in the recipe."
                 )
-        parts = dict[str, Part]()
-        for name, part in self.parts.items():
-            if name in self.quick.without:
-                continue
-            changes = self.quick.parts.get(name, {})
-            part_settings = settings.merge_mappings(part.settings, changes)
-            parts[name] = part.model_copy(update={"settings": part_settings})
-        return self.model_copy(
-            update={
-                "settings": settings.merge_mappings(self.settings, self.quick.settings),
-                "parts": parts,
-            }
+        parts = {
+            name: self._change_part(name)
+            for name in self.parts
+            if name not in self.quick.without
+        }
+        quick_settings = settings.merge_mappings(self.settings, self.quick.settings)
+        return self.model_copy(update={"settings": quick_settings, "parts": parts})
+
+    def _change_part(self, name: str) -> Part:
+        """Return a part with the changes that `quick` has for its settings."""
+        part = self.parts[name]
+        changes = self.quick.parts.get(name, {})
+        part_settings = settings.merge_mappings(part.settings, changes)
+        return part.model_copy(update={"settings": part_settings})
+
+
+def _check_part_name(name: str) -> None:
+    """Raise an error if a part cannot have this name."""
+    if not re.fullmatch(r"[a-z0-9][a-z0-9-]{0,39}", name):
+        raise ValueError(
+            f"expected names of small letters, digits and hyphens, got {name[:40]!r}"
         )
+    if name == PHOTOGRAPHS:
+        raise ValueError(f"expected another name than {name!r}, which photographs have")
 
 
 def list_recipes() -> tuple[str, ...]:
@@ -297,24 +315,13 @@ def plan_runs(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
         for index, values in enumerate(product(*axes.values())):
             value_of_setting = dict(zip(axes, values, strict=True))
             run_config = _make_run_config(recipe, name, index, value_of_setting, config)
-            # the object, and what else differs between the runs of the part
-            words = [
-                value
-                for axis, value in value_of_setting.items()
-                if axis == "object" or len(axes[axis]) > 1
-            ]
-            suffix = f"{index:02d}-{make_directory_name(words)}"
+            suffix = f"{index:02d}-{_name_combination(axes, value_of_setting)}"
             # `around` of a part is the name of a part; that of a run is a directory.
-            search_directory = None
-            if part.around is not None:
-                search_directory = f"{part.around}-{suffix}"
+            search_directory = (
+                None if part.around is None else f"{part.around}-{suffix}"
+            )
             runs.append(
-                PlannedRun(
-                    name=f"{name}-{suffix}",
-                    part_name=name,
-                    config=run_config,
-                    search_run_name=search_directory,
-                )
+                PlannedRun(f"{name}-{suffix}", name, run_config, search_directory)
             )
     if len(runs) > MAX_RUNS:
         raise InputError(
@@ -322,6 +329,23 @@ def plan_runs(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
             f"{len(runs)}; name fewer objects"
         )
     return runs
+
+
+def _name_combination(
+    axes: Mapping[str, Sequence[str]], value_of_setting: Mapping[str, str]
+) -> str:
+    """Name a run after its object, and what else differs between runs of its part.
+
+    Args:
+        axes: all values of each setting that is combined.
+        value_of_setting: the values of the run.
+    """
+    words = [
+        value
+        for axis, value in value_of_setting.items()
+        if axis == "object" or len(axes[axis]) > 1
+    ]
+    return make_directory_name(words)
 
 
 def _list_axes(recipe: Recipe, part: Part) -> dict[str, list[str]]:
@@ -379,7 +403,11 @@ def _make_run_config(
     label = config.find_label(value_of_setting["object"])
     if label is not None:
         run_settings["label"] = label
-    where = f"{config.recipe}: parts: {name}"
+    return _make_part_config(part, run_settings, f"{config.recipe}: parts: {name}")
+
+
+def _make_part_config(part: Part, run_settings: Settings, where: str) -> SceneConfig:
+    """Make the settings of a part's command; errors begin with `where`."""
     config_type = CONFIGS[part.command]
     try:
         return config_type(**run_settings)
@@ -433,22 +461,8 @@ def apply_command_settings(recipe: Recipe, config: RecipeConfig) -> Recipe:
     """
     if config.quick:
         recipe = recipe.apply_quick()
-    names = (
-        "object",
-        "environment",
-        "model",
-        "labels",
-        "prompt",
-        "value_range",
-        "task",
-        "up",
-        "facing",
-        "size",
-        "unit",
-        "resolution",
-    )
     merged: Settings = dict(recipe.settings)
-    for name in names:
+    for name in REPLACED_SETTINGS:
         value = getattr(config, name)
         if value is not None:
             merged[name] = value
