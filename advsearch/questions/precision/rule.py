@@ -166,11 +166,7 @@ def estimate_reference(
     # for each part, the function of the mean of all others
     jackknife_values = [function((total - part) / (count - 1)) for part in parts]
     center = np.mean(jackknife_values, axis=0)
-    sum_of_squares = sum(
-        float(np.sum((jackknife_value - center) ** 2))
-        for jackknife_value in jackknife_values
-    )
-    scatter = math.sqrt((count - 1) / count * sum_of_squares)
+    scatter = _compute_scatter(jackknife_values, center)
     # Two parts are too few to estimate a bias.
     bias_estimate = 0.0
     if count > 2:
@@ -183,6 +179,23 @@ def estimate_reference(
     return ReferenceValue(
         value, error=relative_error(error, norm), norm=norm, n_parts=count
     )
+
+
+def _compute_scatter(
+    jackknife_values: Sequence[Float64Array], center: Float64Array
+) -> float:
+    """Compute the jackknife's standard error of a value.
+
+    Args:
+        jackknife_values: the value (m,) without each part in turn.
+        center: (m,) their mean.
+    """
+    count = len(jackknife_values)
+    sum_of_squares = sum(
+        float(np.sum((jackknife_value - center) ** 2))
+        for jackknife_value in jackknife_values
+    )
+    return math.sqrt((count - 1) / count * sum_of_squares)
 
 
 def summarize_samples(
@@ -227,11 +240,18 @@ def summarize_samples(
         "reference_error": reference_error,
         "heavy_tailed": is_heavy,
         "cosine": _average_cosine(samples) if setting.quantity == "gradient" else None,
+        **_find_median_times(samples),
     }
-    for name in ("seconds", "wall_seconds"):
-        if name in samples[0]:
-            fields[name] = median_time([numbers[name] for numbers in samples])
     return PrecisionPoint.from_values({**vars(setting), **fields})
+
+
+def _find_median_times(samples: Sequence[Numbers]) -> dict[str, float]:
+    """Return the median of each of the times that the measurements have."""
+    return {
+        name: median_time([numbers[name] for numbers in samples])
+        for name in ("seconds", "wall_seconds")
+        if name in samples[0]
+    }
 
 
 def _average_cosine(samples: Sequence[Numbers]) -> float | None:
@@ -322,10 +342,8 @@ def fit_line(
     known = [point for point in points if point.has_known_error]
     if len({point.spp for point in known}) < MIN_FIT_POINTS:
         return None
-    line = linregress(
-        np.log([float(point.spp) for point in known]),
-        np.log([point.rms_error for point in known]),
-    )
+    log_counts = np.log([float(point.spp) for point in known])
+    line = linregress(log_counts, np.log([point.rms_error for point in known]))
     slope = float(line.slope)
     # Student's t distribution; `len(known)` - 2, as the fit has two parameters
     quantile = float(stdtrit(len(known) - 2, (1.0 + CONFIDENCE) / 2.0))
@@ -380,19 +398,23 @@ def describe_disagreement(
         return None
     # Slopes are negative: the smaller, the steeper.
     is_steeper = slope.slope <= slope.theory
-    if is_steeper:
-        reason = "the smallest sample counts are not in the asymptotic range yet"
-    elif has_leveled_off(points):
-        reason = "it levels off: there is a bias, which more samples do not remove"
-    else:
-        reason = "heavy-tailed noise, clipping with few samples, or a bias"
     return (
         f"{slope.control or slope.quantity} by {slope.estimator}: the error falls with "
         f"slope {slope.slope:.2f} against "
         f"samples (95 %: {slope.interval[0]:.2f} to {slope.interval[1]:.2f}), theory "
         f"predicts {slope.theory:g}"
-        f"{' or steeper' if slope.or_steeper else ''}: {reason}"
+        f"{' or steeper' if slope.or_steeper else ''}: "
+        f"{_explain_disagreement(is_steeper, points)}"
     )
+
+
+def _explain_disagreement(is_steeper: bool, points: Sequence[PrecisionPoint]) -> str:
+    """Return the most likely reason for a slope that disagrees with theory."""
+    if is_steeper:
+        return "the smallest sample counts are not in the asymptotic range yet"
+    if has_leveled_off(points):
+        return "it levels off: there is a bias, which more samples do not remove"
+    return "heavy-tailed noise, clipping with few samples, or a bias"
 
 
 def has_leveled_off(points: Sequence[PrecisionPoint]) -> bool:
@@ -467,15 +489,13 @@ def recommend_spp(
         error = _error_on_line(line, spp)
     else:
         error = _interpolate_error(ordered, spp, line)
-    seconds = [point.seconds for point in ordered]
     return Recommended(
         quantity=ordered[0].quantity,
         control=ordered[0].control,
         goal=goal,
         estimator=ordered[0].estimator,
         spp=spp,
-        # slope 1: beyond the last point, time is proportional to samples
-        seconds=_interpolate_value(ordered, spp, seconds, slope=1.0),
+        seconds=_interpolate_seconds(ordered, spp),
         error=error,
         basis=basis,
     )
@@ -553,6 +573,13 @@ def _interpolate_error(
         slope = max(line.slope, MIN_EXTRAPOLATED_SLOPE)
     errors = [point.rms_error for point in ordered]
     return _interpolate_value(ordered, spp, errors, slope)
+
+
+def _interpolate_seconds(ordered: Sequence[PrecisionPoint], spp: int) -> float:
+    """Return the seconds at a sample count, interpolated between points."""
+    seconds = [point.seconds for point in ordered]
+    # slope 1: beyond the last point, time is proportional to samples
+    return _interpolate_value(ordered, spp, seconds, slope=1.0)
 
 
 def confirm_recommendation(
@@ -650,11 +677,7 @@ def _extrapolate_count(
             not matter here.
     """
     last = ordered[-1]
-    slope = None
-    if line:
-        slope = line.slope
-    elif or_steeper is not None:
-        slope = MONTE_CARLO_SLOPE
+    slope = _choose_extrapolated_slope(line, or_steeper)
     # Slopes are negative: the larger, the flatter.
     is_too_flat = slope is not None and slope > MAX_FALLING_SLOPE
     if slope is None or is_too_flat:
@@ -666,6 +689,20 @@ def _extrapolate_count(
     # error ~ samples^slope, so samples ~ error^(1 / slope)
     factor = (goal / last.rms_error) ** (1.0 / used_slope)
     return last.spp * factor if factor <= MAX_EXTRAPOLATION else None
+
+
+def _choose_extrapolated_slope(
+    line: PrecisionSlope | None, or_steeper: bool | None
+) -> float | None:
+    """Return the slope of a line, or that of theory; None if neither is known.
+
+    Args:
+        line: fitted line; None if there is none.
+        or_steeper: None if theory predicts no slope.
+    """
+    if line:
+        return line.slope
+    return None if or_steeper is None else MONTE_CARLO_SLOPE
 
 
 def _interpolate_value(
