@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isqrt
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeGuard
 
 import numpy as np
 import torch
@@ -165,13 +165,7 @@ class _Block(BaseModel):
         """
         is_small = len(values) <= MAX_FINE_VALUES
         stores_signs = signs and not is_small
-        step = COARSE_STEP
-        if is_small:
-            step = FINE_STEP
-        elif stores_signs:
-            # With the largest offset as the step, rounding leaves only -1, 0 and 1. If
-            # all offsets are 0, the step may be any positive number.
-            step = float(np.abs(values).max()) or 1.0
+        step = _choose_quantum(values, is_small=is_small, stores_signs=stores_signs)
         # A texture has side * side texels of 3 values.
         side = isqrt(len(values) // 3)
         is_texture = not is_small and 3 * side * side == len(values)
@@ -233,6 +227,23 @@ class _Block(BaseModel):
         if self.signs:
             return _unpack_signs(data, n_steps)
         return np.frombuffer(data, "<i2")
+
+
+def _choose_quantum(values: Floats, *, is_small: bool, stores_signs: bool) -> float:
+    """Return the step of which the offsets of a block are stored as multiples.
+
+    Args:
+        values: the offsets (n,).
+        is_small: whether the block has few values.
+        stores_signs: whether only signs are stored.
+    """
+    if is_small:
+        return FINE_STEP
+    if stores_signs:
+        # With the largest offset as the step, rounding leaves only -1, 0 and 1. If
+        # all offsets are 0, the step may be any positive number.
+        return float(np.abs(values).max()) or 1.0
+    return COARSE_STEP
 
 
 def _average_squares(values: Floats, side: int, square: int) -> Floats:
@@ -336,19 +347,11 @@ class Counterexample:
             InputError: its settings do not suit that network.
         """
         changed = {name: value for name, value in changes.items() if value is not None}
-        network_settings = {
-            name: value
-            for name, value in {**suite.settings, **changed}.items()
-            if name in MODEL_SETTINGS
-        }
-        replaces_network = "model" in network_settings
+        network_settings = _select_network_settings({**suite.settings, **changed})
         # settings that are reset to their defaults
         reset_names = {*SUITE_SETTINGS}
-        if replaces_network:
+        if network_settings:
             reset_names |= {*MODEL_SETTINGS}
-        else:
-            # Settings of one network do not suit another: none of them is used.
-            network_settings = {}
         defaults = {
             setting.name: setting.default
             for setting in settings.settings(AttackConfig)
@@ -379,6 +382,16 @@ class Counterexample:
                 "add the adversarial scene of a new run"
             )
         return (start + torch.from_numpy(self.clean_offsets)).clamp(0.0, 1.0)
+
+
+def _select_network_settings(values: Mapping[str, object]) -> dict[str, object]:
+    """Return the settings of the network under test, if they name a model; else none.
+
+    Settings of one network do not suit another.
+    """
+    if "model" not in values:
+        return {}
+    return {name: value for name, value in values.items() if name in MODEL_SETTINGS}
 
 
 def counterexample_directory(suite: str) -> Path:
@@ -499,11 +512,10 @@ def _fails_on_example(
     for index in range(trials):
         # a stream of seeds that only these trials use
         seed = seeds.derive_seed(problem.seed, "kept", index)
-        judgements = []
-        for configuration in configurations:
-            picture = problem.picture(configuration, seed, example.spp)
-            full_configuration = problem.make_full_configuration(configuration, seed)
-            judgements.append(problem.judge(picture, full_configuration))
+        judgements = [
+            _judge_render(problem, configuration, seed, example.spp)
+            for configuration in configurations
+        ]
         is_right = is_right_in_trial(*judgements)
         outcomes.append(is_right)
         # After one right trial, the verdict of a single scene cannot be FAILED.
@@ -512,6 +524,15 @@ def _fails_on_example(
     n_right = outcomes.count(True)
     n_wrong = outcomes.count(False)
     return decide_trials(n_right, n_wrong, has_conditions=has_conditions) == FAILED
+
+
+def _judge_render(
+    problem: Problem, configuration: Tensor, seed: int, spp: int
+) -> tasks.Judgement:
+    """Render a configuration (d,), and judge the prediction about it."""
+    picture = problem.picture(configuration, seed, spp)
+    full_configuration = problem.make_full_configuration(configuration, seed)
+    return problem.judge(picture, full_configuration)
 
 
 def add_counterexample(suite: str, run: str) -> Counterexample:
@@ -530,16 +551,7 @@ def add_counterexample(suite: str, run: str) -> Counterexample:
     """
     path = directory.find_run(run)
     summary = workbench.load_attack_summary(path)
-    if summary.ending != "found" or summary.verified is None:
-        raise InputError(
-            f"add: expected a run that ended as 'found', got {path}, "
-            f"which ended with {summary.ending!r}"
-        )
-    if summary.minimises:  # the objective: the search made the object easier
-        raise InputError(
-            f"add: expected a run that makes the model wrong, got {path}, "
-            "which makes the object easier"
-        )
+    _check_addable(path, summary)
     parts = workbench.load_parts_of_run(path)
     problem, _warnings = workbench.make_problem_with_warnings(parts)
     configuration = workbench.read_stored_configuration(path, problem)
@@ -553,6 +565,20 @@ def add_counterexample(suite: str, run: str) -> Counterexample:
     return _write_smallest(
         base, values, offsets, problem, has_conditions=varies_conditions(config)
     )
+
+
+def _check_addable(path: Path, summary: workbench.AttackSummary) -> None:
+    """Raise an error unless an attack has found a scene that the model gets wrong."""
+    if summary.ending != "found" or summary.verified is None:
+        raise InputError(
+            f"add: expected a run that ended as 'found', got {path}, "
+            f"which ended with {summary.ending!r}"
+        )
+    if summary.minimises:  # the objective: the search made the object easier
+        raise InputError(
+            f"add: expected a run that makes the model wrong, got {path}, "
+            "which makes the object easier"
+        )
 
 
 def _make_values(
@@ -619,11 +645,7 @@ def _write_smallest(
     has_large_block = max(block_sizes) > MAX_FINE_VALUES
     if not has_large_block:
         coarse_forms = []
-    trials = count_trials(has_conditions=has_conditions)
-    if not has_conditions:
-        # The model has to be wrong in all trials. Twice as many trials as the suite
-        # makes, so that the model will most likely fail there, too.
-        trials *= 2
+    trials = _count_confirming_trials(has_conditions=has_conditions)
     for stores_signs, square in coarse_forms:
         # This replaces the file of the form before.
         example = _write_form(base, values, blocks, stores_signs, square)
@@ -631,6 +653,14 @@ def _write_smallest(
             return example
     stores_signs, square = finest_form
     return _write_form(base, values, blocks, stores_signs, square)
+
+
+def _count_confirming_trials(*, has_conditions: bool) -> int:
+    """Return the number of trials by the run's own model before an example is stored."""
+    trials = count_trials(has_conditions=has_conditions)
+    # If conditions do not vary, the model has to be wrong in all trials. Twice as many
+    # trials as the suite makes, so that the model will most likely fail there, too.
+    return trials if has_conditions else 2 * trials
 
 
 def _write_form(
@@ -786,17 +816,19 @@ def read_expected(suite: str) -> dict[str, str]:
         raise errors.FileFormatError(
             f"{path}: expected verdicts by claim, got {str(error)[:80]}; remove it"
         ) from None
-    verdicts: Any = None
-    if isinstance(values, dict):
-        verdicts = values.get("expected")
-    has_verdicts = isinstance(verdicts, dict) and all(
-        str(verdict) in VERDICTS for verdict in verdicts.values()
-    )
-    if not has_verdicts:
+    verdicts = values.get("expected") if isinstance(values, dict) else None
+    if not _are_verdicts(verdicts):
         raise errors.FileFormatError(
             f"{path}: expected verdicts by claim, got something else; remove it"
         )
     return {str(name): str(verdict) for name, verdict in verdicts.items()}
+
+
+def _are_verdicts(values: Any) -> TypeGuard[dict[Any, Any]]:
+    """Return whether a value that was read from a file has verdicts by claim."""
+    return isinstance(values, dict) and all(
+        str(verdict) in VERDICTS for verdict in values.values()
+    )
 
 
 def write_expected(suite: str, verdicts: Mapping[str, str]) -> list[str]:
