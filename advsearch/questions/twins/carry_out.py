@@ -8,7 +8,7 @@ from __future__ import annotations
 import gc
 import io
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from pathlib import Path
@@ -142,14 +142,7 @@ class ModelJudge:
             (judgement,) = workbench.judge_images(
                 self.task, output, rounded[None], [truth]
             )
-            yield TwinPrediction(
-                surroundings=name,
-                label=judgement.prediction.label,
-                probability=judgement.prediction.probability,
-                right=judgement.right,
-                margin=judgement.margin,
-                payload=judgement.payload,
-            )
+            yield _make_twin_prediction(name, judgement)
 
     def _calibrate_once(self, twin: rendering.Twin, truth: Any) -> None:
         """Calibrate a task that needs it, with the first photograph.
@@ -170,6 +163,20 @@ class ModelJudge:
         # A task without calibration may be ambiguous, too.
         if self.task.ambiguity_message:
             raise InputError(f"task {self.task.name}: {self.task.ambiguity_message}")
+
+
+def _make_twin_prediction(
+    surroundings: str, judgement: tasks.Judgement
+) -> TwinPrediction:
+    """Make the stored prediction about an image with some surroundings."""
+    return TwinPrediction(
+        surroundings=surroundings,
+        label=judgement.prediction.label,
+        probability=judgement.prediction.probability,
+        right=judgement.right,
+        margin=judgement.margin,
+        payload=judgement.payload,
+    )
 
 
 def load_judges(
@@ -199,15 +206,7 @@ def load_judges(
     # The function's type is for `SceneConfig`, which has the same settings of models.
     scene_config: Any = config
     models, warnings = workbench.load_models(networks, task, scene_config)
-    if len({model.input_size for model in models}) > 1:
-        sizes = ", ".join(
-            f"{model.name} {model.input_size[1]} x {model.input_size[0]}"
-            for model in models
-        )
-        raise InputError(
-            f"model: expected models that take pictures of one size, got {sizes}; "
-            "compare them one by one"
-        )
+    _check_input_sizes(models)
     if not network_of_frame:
         return [ModelJudge(task, model, {}) for model in models], warnings
     # `models` are in the order of `networks`.
@@ -217,6 +216,19 @@ def load_judges(
     }
     # The first model predicts frames that the mapping does not have.
     return [ModelJudge(task, models[0], model_of_frame)], warnings
+
+
+def _check_input_sizes(models: Sequence[Model]) -> None:
+    """Raise an error if models take images of different sizes."""
+    if len({model.input_size for model in models}) > 1:
+        sizes = ", ".join(
+            f"{model.name} {model.input_size[1]} x {model.input_size[0]}"
+            for model in models
+        )
+        raise InputError(
+            f"model: expected models that take pictures of one size, got {sizes}; "
+            "compare them one by one"
+        )
 
 
 class Comparison:
@@ -281,6 +293,24 @@ class Comparison:
             for number, item in candidates.items()
             if not self._is_hidden(item)
         }
+        windows = self._choose_windows(visible)
+        if not windows:
+            raise InputError(
+                "photographs: no object is left; check `frames` and `visible`"
+            )
+        warnings = self._describe_left_out(
+            n_hidden=len(candidates) - len(visible),
+            n_outside=len(visible) - len(windows),
+        )
+        return Selection(objects, windows, warnings)
+
+    def _choose_windows(
+        self, visible: Mapping[int, PhotographedObject]
+    ) -> dict[int, rendering.PhotoWindow]:
+        """Return the windows of visible objects by their numbers, and check their labels.
+
+        Objects that are out of view, or tiny, have none.
+        """
         assets: dict[Path, Any] = {}
         checked_labels: set[tuple[str, str]] = set()
         windows: dict[int, rendering.PhotoWindow] = {}
@@ -296,15 +326,7 @@ class Comparison:
             window = self._choose_window(item, assets[item.mesh])
             if window is not None:
                 windows[number] = window
-        if not windows:
-            raise InputError(
-                "photographs: no object is left; check `frames` and `visible`"
-            )
-        warnings = self._describe_left_out(
-            n_hidden=len(candidates) - len(visible),
-            n_outside=len(visible) - len(windows),
-        )
-        return Selection(objects, windows, warnings)
+        return windows
 
     def _is_hidden(self, item: PhotographedObject) -> bool:
         """Return whether less of an object is visible than `visible` requires.
@@ -396,14 +418,7 @@ class Comparison:
         # the environment is made.
         layers = self._render_layers(selection, missing)
         gc.collect()
-        renderer = None  # not used if all rows are stored
-        if missing:
-            renderer = self._make_renderer(
-                rendering.SurroundedRenderer,
-                self._config.environment_name,
-                selection,
-                missing,
-            )
+        renderer = self._make_surrounded_renderer(selection, missing)
         for number in numbers:
             layer = layers.pop(number, None)  # None if the rows are stored
             # The twin is rendered once for all models, and not at all if all rows are
@@ -454,6 +469,19 @@ class Comparison:
             self.n_renders += 1
         return layers
 
+    def _make_surrounded_renderer(
+        self, selection: Selection, numbers: Sequence[int]
+    ) -> Any:
+        """Make the renderer of one mesh in the environment; None without objects."""
+        if not numbers:  # all rows are stored
+            return None
+        return self._make_renderer(
+            rendering.SurroundedRenderer,
+            self._config.environment_name,
+            selection,
+            numbers,
+        )
+
     def _make_renderer(
         self,
         renderer_type: Any,
@@ -501,16 +529,14 @@ class Comparison:
         """
         item = selection.objects[number]
         window = selection.window_by_row_number[number]
-        environment = self._config.environment_name
         render = renderer.render(item, window, number)
-        render_of_environment = {environment: render}
         self.n_renders += 1
         twin = rendering.make_twin(
             item,
             self._load_photograph(item.photograph),
             window,
             layer,
-            render_of_environment,
+            {self._config.environment_name: render},
             self._size,
         )
         self._save_images(number, twin)
@@ -596,6 +622,7 @@ class Comparison:
             factors = counting.explain_disagreement(rows, COMPOSED)
         overlaps = [row.overlap for row in rows if row.overlap is not None]
         worst = sorted(rows, key=rank_disagreement)[: self._config.pictures]
+        pairs = [TwinPair(row=row, pictures=list_images(row.number)) for row in worst]
         return self._context.result(
             TwinsResult,
             photographs=self._config.photographs,
@@ -605,9 +632,7 @@ class Comparison:
             overlap=float(np.median(overlaps)) if overlaps else None,
             low_overlaps=sum(overlap < LOW_OVERLAP for overlap in overlaps),
             factors=factors,
-            pairs=[
-                TwinPair(row=row, pictures=list_images(row.number)) for row in worst
-            ],
+            pairs=pairs,
             renders=self.n_renders,
             warnings=list(dict.fromkeys(warnings)),
         )
@@ -651,18 +676,26 @@ def parse_frames(text: str | None) -> Callable[[str], bool]:
             raise InputError(
                 f"frames: expected a name or a range such as 0:600, got {entry[:40]}"
             )
+    return partial(_is_frame_selected, names, ranges)
 
-    def is_used(frame: str) -> bool:
-        """Return whether the frame is selected by its name or its number."""
-        # "scene/000012" and "000012.png" both have the number "000012".
-        number = frame.rpartition("/")[2].partition(".")[0]
-        if frame in names or number in names:
-            return True
-        return number.isdecimal() and any(
-            first <= int(number) <= last for first, last in ranges
-        )
 
-    return is_used
+def _is_frame_selected(
+    names: Container[str], ranges: Sequence[tuple[int, int]], frame: str
+) -> bool:
+    """Return whether a frame is selected by its name or its number.
+
+    Args:
+        names: selected names and numbers.
+        ranges: first and last of each selected range of numbers.
+        frame: name of the frame.
+    """
+    # "scene/000012" and "000012.png" both have the number "000012".
+    number = frame.rpartition("/")[2].partition(".")[0]
+    if frame in names or number in names:
+        return True
+    return number.isdecimal() and any(
+        first <= int(number) <= last for first, last in ranges
+    )
 
 
 def make_row_name(number: int, model_index: int) -> str:

@@ -45,14 +45,6 @@ def _make_model_table(
         model: name of the model.
         task: title of the task.
     """
-    objects = sorted({row.object for row in rows})
-    conditions = sorted({row.condition for row in rows if row.condition})
-    groups: list[tuple[str, str, Sequence[TwinRow]]] = [("", "", rows)]
-    if len(objects) > 1:
-        for name in objects:
-            groups.append((name, "", [row for row in rows if row.object == name]))
-    for name in conditions:
-        groups.append(("", name, [row for row in rows if row.condition == name]))
     return [
         count_agreement(
             group,
@@ -63,9 +55,27 @@ def _make_model_table(
             condition=condition,
         )
         for name in surroundings
-        for object_name, condition, group in groups
-        if group
+        for object_name, condition, group in _list_groups(rows)
     ]
+
+
+def _list_groups(
+    rows: Sequence[TwinRow],
+) -> list[tuple[str, str, Sequence[TwinRow]]]:
+    """Return all rows, those of each object if there are several, and of each condition.
+
+    Each group is (object, condition, rows); an empty name stands for all. There are no
+    empty groups.
+    """
+    objects = sorted({row.object for row in rows})
+    conditions = sorted({row.condition for row in rows if row.condition})
+    groups: list[tuple[str, str, Sequence[TwinRow]]] = [("", "", rows)]
+    if len(objects) > 1:
+        for name in objects:
+            groups.append((name, "", [row for row in rows if row.object == name]))
+    for name in conditions:
+        groups.append(("", name, [row for row in rows if row.condition == name]))
+    return [group for group in groups if group[2]]
 
 
 def count_agreement(
@@ -322,9 +332,7 @@ def _cut_factor(
     part_of_row = np.searchsorted(edges, values, side="right") - 1
     part_of_row = np.clip(part_of_row, 0, N_PARTS - 1)
     units = number_units(rows)
-    disagrees = np.array(
-        [row.photo.right != row.twin(surroundings).right for row in rows]
-    )
+    disagrees = _find_disagreements(rows, surroundings)
     for part in range(N_PARTS):
         inside = part_of_row == part
         yield FactorPart(
@@ -336,3 +344,9 @@ def _cut_factor(
             disagreeing=int(disagrees[inside].sum()),
             rate=estimate_rate(disagrees[inside], units[inside]),
         )
+
+
+def _find_disagreements(rows: Sequence[TwinRow], surroundings: str) -> BoolArray:
+    """Return whether only one of photograph and twin is right, for each row (n,)."""
+    disagrees = [row.photo.right != row.twin(surroundings).right for row in rows]
+    return np.array(disagrees)

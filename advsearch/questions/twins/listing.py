@@ -206,36 +206,68 @@ def _read_scene(scene: Path, models: Path, condition: str) -> Listing:
     infos: Mapping[str, Any] = {}
     if (scene / "scene_gt_info.json").is_file():
         infos = _read_json(scene / "scene_gt_info.json")
+    bop_scene = _BopScene(scene, models, condition, cameras, infos)
     objects: list[PhotographedObject] = []
     n_missing = 0
     for image, entries in truths.items():
-        where = f"{scene / GROUND_TRUTH}: image {image[:20]}"
+        image_objects = bop_scene.read_objects(image, entries)
+        # Data sets are often downloaded without all photographs.
+        if image_objects is None:
+            n_missing += len(entries)
+        else:
+            objects += image_objects
+    return Listing(objects, n_missing)
+
+
+@dataclass(frozen=True)
+class _BopScene:
+    """A scene of a data set in BOP's form.
+
+    Attributes:
+        directory: directory of the scene.
+        models: directory of the meshes.
+        condition: condition of all its photographs, such as "night"; or empty.
+        cameras: the camera of each image, by its number as text, unchecked.
+        infos: likewise, what `scene_gt_info.json` has about the image's objects.
+    """
+
+    directory: Path
+    models: Path
+    condition: str
+    cameras: Mapping[str, Any]
+    infos: Mapping[str, Any]
+
+    def read_objects(self, image: str, entries: Any) -> list[PhotographedObject] | None:
+        """Read the objects of an image; None if its photograph is missing.
+
+        Args:
+            image: number of the image, as text.
+            entries: what the ground truth has about it, unchecked.
+        """
+        where = f"{self.directory / GROUND_TRUTH}: image {image[:20]}"
         is_number = image.isdecimal() and len(image) <= MAX_IMAGE_DIGITS
         if not is_number or not _is_rows(entries):
             raise errors.FileFormatError(f"{where}: expected a list of objects")
-        photograph = _find_photograph(scene, int(image))
-        # Data sets are often downloaded without all photographs.
+        photograph = _find_photograph(self.directory, int(image))
         if photograph is None:
-            n_missing += len(entries)
-            continue
+            return None
         shared: dict[str, Any] = {
             "photograph": photograph,
-            "frame": f"{scene.name}/{image}",
-            "camera": _read_bop_camera(scene, cameras, image),
+            "frame": f"{self.directory.name}/{image}",
+            "camera": _read_bop_camera(self.directory, self.cameras, image),
             "unit": "mm",
-            "condition": condition,
+            "condition": self.condition,
             "where": where,
         }
-        image_infos = infos.get(image)
-        for index, entry in enumerate(entries):
-            objects.append(
-                PhotographedObject(
-                    **shared,
-                    **_read_bop_silhouette(scene, image, index, image_infos),
-                    **_read_bop_object(where, entry, models),
-                )
+        infos = self.infos.get(image)
+        return [
+            PhotographedObject(
+                **shared,
+                **_read_bop_silhouette(self.directory, image, index, infos),
+                **_read_bop_object(where, entry, self.models),
             )
-    return Listing(objects, n_missing)
+            for index, entry in enumerate(entries)
+        ]
 
 
 def _read_bop_silhouette(
@@ -359,23 +391,7 @@ def _read_rows(path: Path) -> list[dict[str, Any]]:
 
     A row is a mapping. Rows of CSV have texts as values, and no keys for empty cells.
     """
-    suffix = path.suffix.lower()
-    is_yaml = suffix not in (".csv", ".json")  # ".yaml" or ".yml"
-    text = stored_files.read_existing_text(
-        path, "a list of photographs", MAX_YAML_BYTES if is_yaml else MAX_JSON_BYTES
-    )
-    rows: Any
-    if suffix == ".csv":
-        rows = [
-            {key: value for key, value in row.items() if value}
-            for row in csv.DictReader(io.StringIO(text))
-        ]
-    elif suffix == ".json":
-        rows = stored_files.parse_text(path, text, "JSON", stored_files.parse_json)
-    else:
-        from advsearch.extend import workbench  # imports torch
-
-        rows = stored_files.parse_text(path, text, "YAML", workbench.parse_yaml)
+    rows = _parse_list(path)
     if isinstance(rows, dict):  # JSON or YAML with the list under this key
         rows = rows.get("photographs")
     if not _is_rows(rows):
@@ -383,6 +399,25 @@ def _read_rows(path: Path) -> list[dict[str, Any]]:
             f"{path}: expected a list with a row for each object in a photograph"
         )
     return list(rows)
+
+
+def _parse_list(path: Path) -> Any:
+    """Return the content of a list of photographs, in CSV, JSON or YAML, unchecked."""
+    suffix = path.suffix.lower()
+    is_yaml = suffix not in (".csv", ".json")  # ".yaml" or ".yml"
+    text = stored_files.read_existing_text(
+        path, "a list of photographs", MAX_YAML_BYTES if is_yaml else MAX_JSON_BYTES
+    )
+    if suffix == ".csv":
+        return [
+            {key: value for key, value in row.items() if value}
+            for row in csv.DictReader(io.StringIO(text))
+        ]
+    if suffix == ".json":
+        return stored_files.parse_text(path, text, "JSON", stored_files.parse_json)
+    from advsearch.extend import workbench  # imports torch
+
+    return stored_files.parse_text(path, text, "YAML", workbench.parse_yaml)
 
 
 def _read_row(row: Mapping[str, Any], path: Path, where: str) -> PhotographedObject:
@@ -483,6 +518,20 @@ def _read_row_camera(
 
     file = _get_file(row, "camera", path, where)
     model = workbench.read_camera(str(file))
+    return _scale_to_photograph(model, photograph, where)
+
+
+def _scale_to_photograph(model: Any, photograph: Path, where: str) -> Pinhole:
+    """Return the pinhole of a camera model, in pixels of a photograph.
+
+    Args:
+        model: the camera model; its lengths are fractions of the width and the height.
+        photograph: path of the photograph.
+        where: the list and the row, for messages.
+
+    Raises:
+        InputError: the lens has a distortion.
+    """
     # These are fractions of the width and the height.
     lens = {key: model.intrinsic_by_name[key] for key in ("fx", "fy", "cx", "cy")}
     distortion = [
