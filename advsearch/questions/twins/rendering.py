@@ -128,12 +128,10 @@ def choose_window(
     """
     low = positions.min(axis=0)
     high = positions.max(axis=0)
-    photo_height, photo_width = photo_size
     longer = float((high - low).max())
-    is_left_or_above = high[0] <= 0.0 or high[1] <= 0.0
-    is_right_or_below = low[0] >= photo_width or low[1] >= photo_height
-    if is_left_or_above or is_right_or_below or longer < MIN_SILHOUETTE:
+    if _is_out_of_view(low, high, photo_size) or longer < MIN_SILHOUETTE:
         return None
+    photo_height, photo_width = photo_size
     # From here on, sizes are (width, height), as positions are (x, y).
     model_width_height = np.array([model_size[1], model_size[0]], np.float64)
     widened = high - low + 2.0 * margin * longer
@@ -148,6 +146,21 @@ def choose_window(
         width,
         height,
     )
+
+
+def _is_out_of_view(
+    low: Float64Array, high: Float64Array, photo_size: tuple[int, int]
+) -> bool:
+    """Return whether a box lies outside of a photograph.
+
+    Args:
+        low, high: corners (x, y) of the box in pixels.
+        photo_size: (height, width) of the photograph in pixels.
+    """
+    photo_height, photo_width = photo_size
+    is_left_or_above = high[0] <= 0.0 or high[1] <= 0.0
+    is_right_or_below = low[0] >= photo_width or low[1] >= photo_height
+    return bool(is_left_or_above or is_right_or_below)
 
 
 def _center_within(center: float, length: int, limit: int) -> int:
@@ -256,13 +269,9 @@ class LayerRenderer:
             image_inputs = self._make_image_inputs(item, photograph, window)
             # Controls may change the finished image; none varies here.
             composed = renderer.finish_image(rendered, image_inputs, renderer.start)
-        return Layer(
-            composed=composed,
-            alpha=rendered[..., 3].clamp(0.0, 1.0),
-            visible_surface=_make_sight(
-                surfaces, self._asset.size_in_metres, model_size
-            ),
-        )
+        sight = _make_sight(surfaces, self._asset.size_in_metres, model_size)
+        alpha = rendered[..., 3].clamp(0.0, 1.0)
+        return Layer(composed=composed, alpha=alpha, visible_surface=sight)
 
     def _make_image_inputs(
         self,
@@ -362,24 +371,21 @@ def make_twin(
         render_of_environment: sRGB renders (H, W, 3) of the object, by environment.
         model_size: (height, width) in pixels.
     """
-    window_size = (window.height, window.width)
     crop = cut_photograph(photograph, window)
     visible_coverage = _compute_visible_coverage(item, photograph, window, layer)
-    is_covered = visible_coverage >= 0.5
     around = crop[visible_coverage < 0.5]
-    # If the object fills the window, the mean of the window is the best guess.
-    mean_around = around.mean(dim=0) if len(around) else crop.mean(dim=(0, 1))
+    window_size = (window.height, window.width)
     in_environments = {
         name: resize(image, window_size)
         for name, image in render_of_environment.items()
     }
-    hole = torch.lerp(crop, mean_around.expand_as(crop), visible_coverage[..., None])
     images = {
         PHOTOGRAPH: crop,
         COMPOSED: layer.composed,
         **in_environments,
-        HOLE: hole,
+        HOLE: _replace_by_mean(crop, around, visible_coverage),
     }
+    is_covered = visible_coverage >= 0.5
     difference = (layer.composed - crop)[is_covered]
     return Twin(
         images={name: resize(image, model_size) for name, image in images.items()},
@@ -394,6 +400,19 @@ def make_twin(
             layer.composed[is_covered], crop[is_covered]
         ),
     )
+
+
+def _replace_by_mean(crop: Tensor, around: Tensor, visible_coverage: Tensor) -> Tensor:
+    """Return a photograph (h, w, 3) with the object replaced by the mean around it.
+
+    Args:
+        crop: the photograph.
+        around: (n, 3) the pixels around the object; there may be none.
+        visible_coverage: (h, w) how much of each pixel the object covers.
+    """
+    # If the object fills the window, the mean of the window is the best guess.
+    mean_around = around.mean(dim=0) if len(around) else crop.mean(dim=(0, 1))
+    return torch.lerp(crop, mean_around.expand_as(crop), visible_coverage[..., None])
 
 
 def _compute_visible_coverage(
