@@ -488,15 +488,20 @@ def _check_column(
     if len(lacking) == len(columns_of_part):
         # the columns that any part has, for the message
         known = common.union(*columns_of_part.values())
-        known = {column for column in known if not column.endswith(ANY_PARAMETER)}
-        raise errors.UnknownNameError(
-            "column", name, known, f"{location}, as `{option}`."
-        )
+        raise _make_unknown_column_error(name, known, f"{location}, as `{option}`.")
     if lacking:
         raise InputError(
             f"{location}: {lacking[0]} has no {name}; name the "
             "parts that have it as `of`"
         )
+
+
+def _make_unknown_column_error(
+    name: str, known: Collection[str], location: str
+) -> errors.UnknownNameError:
+    """Make the error that no part has a column, with the columns that are known."""
+    listed = {column for column in known if not column.endswith(ANY_PARAMETER)}
+    return errors.UnknownNameError("column", name, listed, location)
 
 
 def _list_parts_without(

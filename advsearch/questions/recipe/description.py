@@ -310,24 +310,28 @@ def plan_runs(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
     """
     recipe = apply_command_settings(recipe, config)
     runs = list[PlannedRun]()
-    for name, part in recipe.parts.items():
-        axes = _list_axes(recipe, part)
-        for index, values in enumerate(product(*axes.values())):
-            value_of_setting = dict(zip(axes, values, strict=True))
-            run_config = _make_run_config(recipe, name, index, value_of_setting, config)
-            suffix = f"{index:02d}-{_name_combination(axes, value_of_setting)}"
-            # `around` of a part is the name of a part; that of a run is a directory.
-            search_directory = (
-                None if part.around is None else f"{part.around}-{suffix}"
-            )
-            runs.append(
-                PlannedRun(f"{name}-{suffix}", name, run_config, search_directory)
-            )
+    for name in recipe.parts:
+        runs += _plan_part(recipe, name, config)
     if len(runs) > MAX_RUNS:
         raise InputError(
             f"{config.recipe}: expected at most {MAX_RUNS} runs, got "
             f"{len(runs)}; name fewer objects"
         )
+    return runs
+
+
+def _plan_part(recipe: Recipe, name: str, config: RecipeConfig) -> list[PlannedRun]:
+    """Plan the runs of one part, by its name."""
+    part = recipe.parts[name]
+    axes = _list_axes(recipe, part)
+    runs = []
+    for index, values in enumerate(product(*axes.values())):
+        value_of_setting = dict(zip(axes, values, strict=True))
+        run_config = _make_run_config(recipe, name, index, value_of_setting, config)
+        suffix = f"{index:02d}-{_name_combination(axes, value_of_setting)}"
+        # `around` of a part is the name of a part; that of a run is a directory.
+        search_directory = None if part.around is None else f"{part.around}-{suffix}"
+        runs.append(PlannedRun(f"{name}-{suffix}", name, run_config, search_directory))
     return runs
 
 
@@ -396,14 +400,21 @@ def _make_run_config(
         **value_of_setting,
         "seed": seeds.derive_seed(config.seed, seed_name),
     }
+    _apply_common_settings(run_settings, config, value_of_setting["object"])
+    return _make_part_config(part, run_settings, f"{config.recipe}: parts: {name}")
+
+
+def _apply_common_settings(
+    run_settings: Settings, config: RecipeConfig, object_name: str
+) -> None:
+    """Add the threads and the label of the command to the settings of a run."""
     if config.deterministic:
         run_settings["deterministic"] = True
     else:
         run_settings["threads"] = config.threads
-    label = config.find_label(value_of_setting["object"])
+    label = config.find_label(object_name)
     if label is not None:
         run_settings["label"] = label
-    return _make_part_config(part, run_settings, f"{config.recipe}: parts: {name}")
 
 
 def _make_part_config(part: Part, run_settings: Settings, where: str) -> SceneConfig:

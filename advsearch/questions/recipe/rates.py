@@ -750,10 +750,7 @@ def _describe_cells(
     where = f" where {options.axis_label}" if is_binned else ""
     has_several_series = len(series) > 1
     for index, name in enumerate(series):
-        tallies = [
-            fractions[index].with_name(bar_name)
-            for bar_name, fractions in cells.items()
-        ]
+        tallies = _select_series(cells, index)
         n_known = sum(tally.total > 0 for tally in tallies)
         # With a single bar there is nothing to compare within a series.
         if has_several_series and n_known < 2:
@@ -767,6 +764,13 @@ def _describe_cells(
             verb=options.verb,
         )
     return text
+
+
+def _select_series(cells: Cells, index: int) -> list[ClusteredFraction]:
+    """Return the fractions of one series, each under the name of its bar."""
+    return [
+        fractions[index].with_name(bar_name) for bar_name, fractions in cells.items()
+    ]
 
 
 def _describe_map_cells(
@@ -1014,12 +1018,7 @@ def _group_rows(
         return split_rows(rows, options.by), None
     values = _read_binned_values(rows, options)
     n_bins = options.bins or DEFAULT_BINS
-    lower, upper = options.range or (values.min(), values.max())
-    if not upper > lower:
-        raise InputError(
-            f"figures: rates: expected values of {options.by} that "
-            f"differ, got {lower:g} to {upper:g}"
-        )
+    lower, upper = _find_range(values, options)
     bin_index = _find_bins(values, lower, upper, n_bins)
     edges = [lower + (upper - lower) * index / n_bins for index in range(n_bins + 1)]
     unit = format_unit(rows, options.by)
@@ -1029,6 +1028,21 @@ def _group_rows(
     }
     centers = [(start + end) / 2 for start, end in pairwise(edges)]
     return groups, centers
+
+
+def _find_range(values: Any, options: RatesOptions) -> tuple[float, float]:
+    """Return the range of the bins: that of the options, or else of the values (n,).
+
+    Raises:
+        InputError: the range is empty.
+    """
+    lower, upper = options.range or (values.min(), values.max())
+    if not upper > lower:
+        raise InputError(
+            f"figures: rates: expected values of {options.by} that "
+            f"differ, got {lower:g} to {upper:g}"
+        )
+    return lower, upper
 
 
 def _name_bin(start: float, end: float, unit: str) -> str:
@@ -1222,14 +1236,7 @@ def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureConten
     Raises:
         InputError: if a part has no rows or other configurations.
     """
-    # A column that only rows of other parts have is empty here, and is removed.
-    renderings = _select_part(rows, options.of[0]).dropna(axis=1, how="all")
-    if renderings.empty:
-        raise InputError(
-            "figures: agreement: expected predictions of a part "
-            f"{options.of[0]!r}, got none"
-        )
-    comparison = _AgreementContent(options, renderings)
+    comparison = _AgreementContent(options, _select_renderings(rows, options.of[0]))
     for part in (PHOTOGRAPHS, *options.of[1:]):
         part_rows = _select_part(rows, part)
         if part == PHOTOGRAPHS and part_rows.empty:
@@ -1248,6 +1255,21 @@ def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureConten
         # object
         size=(FIGURE_WIDTH, 1.7 + 0.2 * n_series + 0.34 * n_objects),
     )
+
+
+def _select_renderings(rows: Rows, part: str) -> Rows:
+    """Return the rows of the part that has the renderings.
+
+    Raises:
+        InputError: it has no rows.
+    """
+    # A column that only rows of other parts have is empty here, and is removed.
+    renderings = _select_part(rows, part).dropna(axis=1, how="all")
+    if renderings.empty:
+        raise InputError(
+            f"figures: agreement: expected predictions of a part {part!r}, got none"
+        )
+    return renderings
 
 
 class _AgreementContent:
@@ -1688,13 +1710,11 @@ def make_surface_figure(rows: Rows, options: Options) -> FigureContent:
             "figures: surface: expected a sweep with `surface: true` "
             "among its parts, got none"
         )
-    table = list[list[Cell]]()
     text = list[str]()
+    table = list[list[Cell]]()
     for surface in surface_of_run.values():
         text += workbench.surface_sentences(surface)
-        table += [
-            _make_surface_cells(surface_table) for surface_table in surface.tables
-        ]
+        table += map(_make_surface_cells, surface.tables)
     folder = rows.attrs["folder"]
     return FigureContent(
         title="Which parts of the surface go with wrong predictions",
