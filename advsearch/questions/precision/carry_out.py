@@ -588,17 +588,8 @@ def recommend_settings(
         or_steeper: returns whether the error of a point may fall faster than that of
             independent samples; None if theory predicts nothing.
     """
-    # one candidate for each estimator, by quantity, control and family
-    candidates: dict[tuple[str, str, str], list[Recommended]] = {}
-    for line in group_by_line(points).values():
-        first = line[0]
-        key = (first.quantity, first.control, first.family)
-        # Without any candidate the list stays empty.
-        comparable = candidates.setdefault(key, [])
-        candidate = recommend_spp(line, goal, round_up, or_steeper(first))
-        if candidate:
-            comparable.append(candidate)
     recommended = []
+    candidates = _list_candidates(points, goal, round_up, or_steeper)
     for (quantity, control, family), comparable in candidates.items():
         best = min(
             comparable,
@@ -610,6 +601,28 @@ def recommend_settings(
             best = _confirm_gradient(best, confirmations, round_up)
         recommended.append(best.model_copy(update={"family": family}))
     return recommended
+
+
+def _list_candidates(
+    points: Sequence[PrecisionPoint],
+    goal: float,
+    round_up: RoundUp,
+    or_steeper: Callable[[PrecisionPoint], bool | None],
+) -> dict[tuple[str, str, str], list[Recommended]]:
+    """Return a candidate for each estimator that reaches the goal.
+
+    They are by quantity, control and family; arguments as for `recommend_settings`.
+    """
+    candidates: dict[tuple[str, str, str], list[Recommended]] = {}
+    for line in group_by_line(points).values():
+        first = line[0]
+        key = (first.quantity, first.control, first.family)
+        # Without any candidate the list stays empty.
+        comparable = candidates.setdefault(key, [])
+        candidate = recommend_spp(line, goal, round_up, or_steeper(first))
+        if candidate:
+            comparable.append(candidate)
+    return candidates
 
 
 def _confirm_gradient(

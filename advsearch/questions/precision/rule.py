@@ -167,18 +167,29 @@ def estimate_reference(
     jackknife_values = [function((total - part) / (count - 1)) for part in parts]
     center = np.mean(jackknife_values, axis=0)
     scatter = _compute_scatter(jackknife_values, center)
-    # Two parts are too few to estimate a bias.
-    bias_estimate = 0.0
-    if count > 2:
-        bias_estimate = (count - 1) * float(np.linalg.norm(center - value))
-    # The estimate of the bias has about the same standard error as the value. So a bias
-    # up to this size may be chance, and the standard error is already counted.
-    bias_estimate = max(0.0, bias_estimate - scatter)
+    noise_bias = _estimate_noise_bias(center - value, count, scatter)
     norm = float(np.linalg.norm(value))
-    error = math.hypot(scatter, bias_estimate, bias)
+    error = math.hypot(scatter, noise_bias, bias)
     return ReferenceValue(
         value, error=relative_error(error, norm), norm=norm, n_parts=count
     )
+
+
+def _estimate_noise_bias(shift: Float64Array, count: int, scatter: float) -> float:
+    """Estimate the bias that noise causes in a value, as far as it is no chance.
+
+    Args:
+        shift: (m,) mean of the jackknife's values minus the value with all parts.
+        count: number of parts.
+        scatter: standard error of the value.
+    """
+    # Two parts are too few to estimate a bias.
+    bias_estimate = 0.0
+    if count > 2:
+        bias_estimate = (count - 1) * float(np.linalg.norm(shift))
+    # The estimate of the bias has about the same standard error as the value. So a bias
+    # up to this size may be chance, and the standard error is already counted.
+    return max(0.0, bias_estimate - scatter)
 
 
 def _compute_scatter(
@@ -477,16 +488,16 @@ def recommend_spp(
         return None
     ordered = sorted(points, key=lambda point: point.spp)
     line = fit_line(ordered)
-    is_explained = line is not None and _explains_points(line, ordered)
-    if line and is_explained:
-        count, basis = _solve_line(line, ordered, goal)
+    explaining_line = line if line and _explains_points(line, ordered) else None
+    if explaining_line:
+        count, basis = _solve_line(explaining_line, ordered, goal)
     else:
         count, basis = _interpolate_count(ordered, goal, line, or_steeper)
     if count is None:
         return None
     spp = round_up(ordered[0], count)
-    if line and is_explained:
-        error = _error_on_line(line, spp)
+    if explaining_line:
+        error = _error_on_line(explaining_line, spp)
     else:
         error = _interpolate_error(ordered, spp, line)
     return Recommended(

@@ -604,16 +604,9 @@ class _Process:
         Raises:
             BlenderError: Blender stopped, or took too long.
         """
-        self._n_images += 1
-        path = self._directory / f"{self._n_images}.exr"
         time_limit = stored_files.scale_limit(MAX_RENDER_SECONDS)
         deadline = time.monotonic() + time_limit
-        assert self._process.stdin is not None
-        try:
-            self._process.stdin.write(f"{seed} {spp} {self._n_images}\n".encode())
-            self._process.stdin.flush()
-        except OSError:
-            pass  # Blender has stopped, which is reported below
+        path = self._request_image(seed, spp)
         # Blender writes the file under its final name when it is complete.
         while not path.is_file():
             self._check_running(path)
@@ -625,6 +618,17 @@ class _Process:
         radiance = _read_radiance(path)
         path.unlink()
         return radiance
+
+    def _request_image(self, seed: int, spp: int) -> Path:
+        """Tell Blender to render an image, and return the path that it will write."""
+        self._n_images += 1
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(f"{seed} {spp} {self._n_images}\n".encode())
+            self._process.stdin.flush()
+        except OSError:
+            pass  # Blender has stopped, which `_check_running` reports
+        return self._directory / f"{self._n_images}.exr"
 
     def _check_running(self, path: Path) -> None:
         """Raise an error if Blender has stopped before it has written an image."""
