@@ -311,7 +311,7 @@ def plan_runs(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
     recipe = apply_command_settings(recipe, config)
     runs = list[PlannedRun]()
     for name in recipe.parts:
-        runs += _plan_part(recipe, name, config)
+        runs += _plan_runs_of_part(recipe, name, config)
     if len(runs) > MAX_RUNS:
         raise InputError(
             f"{config.recipe}: expected at most {MAX_RUNS} runs, got "
@@ -320,7 +320,9 @@ def plan_runs(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
     return runs
 
 
-def _plan_part(recipe: Recipe, name: str, config: RecipeConfig) -> list[PlannedRun]:
+def _plan_runs_of_part(
+    recipe: Recipe, name: str, config: RecipeConfig
+) -> list[PlannedRun]:
     """Plan the runs of one part, by its name."""
     part = recipe.parts[name]
     axes = _list_axes(recipe, part)

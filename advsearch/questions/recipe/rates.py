@@ -1018,7 +1018,7 @@ def _group_rows(
         return split_rows(rows, options.by), None
     values = _read_binned_values(rows, options)
     n_bins = options.bins or DEFAULT_BINS
-    lower, upper = _find_range(values, options)
+    lower, upper = _find_binned_range(values, options)
     bin_index = _find_bins(values, lower, upper, n_bins)
     edges = [lower + (upper - lower) * index / n_bins for index in range(n_bins + 1)]
     unit = format_unit(rows, options.by)
@@ -1030,7 +1030,7 @@ def _group_rows(
     return groups, centers
 
 
-def _find_range(values: Any, options: RatesOptions) -> tuple[float, float]:
+def _find_binned_range(values: Any, options: RatesOptions) -> tuple[float, float]:
     """Return the range of the bins: that of the options, or else of the values (n,).
 
     Raises:

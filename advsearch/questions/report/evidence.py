@@ -551,10 +551,15 @@ def describe_domain(
             domain[part] = DomainPart(Variation.FIXED, fixed_text)
     if domain["place"].variation is Variation.VARIED:
         for part in ("light", "weather"):
-            description = domain[part].description
-            if domain[part].variation is Variation.FIXED:
-                domain[part] = DomainPart(Variation.WITH_ENVIRONMENT, description)
+            domain[part] = _tie_to_environment(domain[part])
     return domain
+
+
+def _tie_to_environment(part: DomainPart) -> DomainPart:
+    """Return a fixed part as one that each environment has; a varied part as it is."""
+    if part.variation is Variation.FIXED:
+        return DomainPart(Variation.WITH_ENVIRONMENT, part.description)
+    return part
 
 
 def _list_varied(
@@ -1315,20 +1320,19 @@ def _make_evidence_run(
     limitations = _describe_limits(
         claims_of_photographs, domain, is_weighted=bool(exposure_lines)
     )
-    return run.model_copy(
-        update={
-            "searched": searched,
-            "excluded": [*_list_quick_remarks(folder), *run.excluded],
-            "criterion": criterion_lines,
-            "triggering": list_triggering_conditions(result),
-            "exposure": exposure_lines,
-            "conditions": conditions,
-            "photographs": count_conditions(result, photo_rows),
-            "twins": _find_twins(folder, result, twins),
-            "domain": {name: part.text for name, part in domain.items()},
-            "limitations": limitations,
-        }
-    )
+    update = {
+        "searched": searched,
+        "excluded": [*_list_quick_remarks(folder), *run.excluded],
+        "criterion": criterion_lines,
+        "triggering": list_triggering_conditions(result),
+        "exposure": exposure_lines,
+        "conditions": conditions,
+        "photographs": count_conditions(result, photo_rows),
+        "twins": _find_twins(folder, result, twins),
+        "domain": {name: part.text for name, part in domain.items()},
+        "limitations": limitations,
+    }
+    return run.model_copy(update=update)
 
 
 def _find_twins(

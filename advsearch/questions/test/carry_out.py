@@ -109,14 +109,21 @@ def try_suite(
     tester = ClaimTester(context, loaded_suite, start_time=start, warnings=remarks)
     suite_run = _SuiteRun(tester, planned, counterexamples.read_expected(config.suite))
     context.ending = suite_run.run_claims()
-    # With `add`, the only result is that of the new counterexample.
-    if added is not None and suite_run.results[0].verdict != FAILED:
+    if added is not None:
+        # With `add`, the only result is that of the new counterexample.
+        _check_added(added, suite_run.results[0], config)
+    return suite_run.make_result(context.ending, added)
+
+
+def _check_added(
+    added: Counterexample, result: ClaimResult, config: SuiteConfig
+) -> None:
+    """Delete a new counterexample, and raise an error, unless the model fails on it."""
+    if result.verdict != FAILED:
         counterexamples.delete_counterexample(added)
         raise InputError(
-            f"add: the adversarial scene of {config.add} is not stored: "
-            f"{suite_run.results[0].reason}"
+            f"add: the adversarial scene of {config.add} is not stored: {result.reason}"
         )
-    return suite_run.make_result(context.ending, added)
 
 
 def _plan_checked_claims(

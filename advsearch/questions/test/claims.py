@@ -448,12 +448,8 @@ class ClaimTester:
         """
         worker_call, worker_config = self._choose_worker(claim, config)
         other_problem, change = self._load_other_side(claim, config, problem)
-        self.progress.stage(
-            name,
-            claim.pictures,
-            hint="fewer pictures in the suite shorten it",
-            at_most=True,
-        )
+        hint = "fewer pictures in the suite shorten it"
+        self.progress.stage(name, claim.pictures, hint=hint, at_most=True)
         queries = sample_queries(
             problem, f"claim {name}", claim.pictures, samples_per_pixel(config)
         )

@@ -456,12 +456,8 @@ def describe_trials(
         interval_text = wording.format_interval(interval)
         reason = f"right in {n_right} of {n_right} {trials} (interval {interval_text})"
     else:
-        lower, upper = interval  # of right trials
-        interval_text = wording.format_interval((1.0 - upper, 1.0 - lower))
-        reason = (
-            f"wrong in {n_wrong} of {n_right + n_wrong} {trials} "
-            f"(interval {interval_text})"
-        )
+        total = f"{n_right + n_wrong} {trials}"
+        reason = _describe_wrong_trials(n_wrong, total, interval)
         reason += f": {outcomes}" if outcomes else f", {wording.add_article(label)}"
     if verdict == UNDECIDED and n_right and n_wrong:
         cause = "conditions" if has_conditions else "noise"
@@ -471,6 +467,21 @@ def describe_trials(
             n_uncounted, has_conditions=has_conditions
         )
     return reason
+
+
+def _describe_wrong_trials(
+    n_wrong: int, total: str, interval: tuple[float, float]
+) -> str:
+    """Describe in how many trials the model is wrong.
+
+    Args:
+        n_wrong: number of these trials.
+        total: number of all trials, with what they are.
+        interval: interval of the fraction of right trials.
+    """
+    lower, upper = interval
+    interval_text = wording.format_interval((1.0 - upper, 1.0 - lower))
+    return f"wrong in {n_wrong} of {total} (interval {interval_text})"
 
 
 def _describe_further_uncounted(n_uncounted: int, *, has_conditions: bool) -> str:
@@ -676,9 +687,7 @@ def format_sarif(result: SuiteResult) -> str:
     Results that are as expected have the state `unchanged`, all others `new`.
     """
     kinds = list(dict.fromkeys(claim.kind for claim in result.claims))
-    suite_lines = list[str]()
-    if Path(result.suite).is_file():
-        suite_lines = Path(result.suite).read_text("utf-8").splitlines()
+    suite_lines = _read_suite_lines(result)
     sarif_results = [
         _sarif_result(result, claim, kinds.index(claim.kind), suite_lines)
         for claim in result.claims
@@ -697,6 +706,12 @@ def format_sarif(result: SuiteResult) -> str:
     }
     log = {"$schema": SARIF_SCHEMA, "version": "2.1.0", "runs": [run]}
     return json.dumps(log, indent=2, ensure_ascii=False) + "\n"
+
+
+def _read_suite_lines(result: SuiteResult) -> list[str]:
+    """Return the lines of the suite's file; none if it does not exist any more."""
+    path = Path(result.suite)
+    return path.read_text("utf-8").splitlines() if path.is_file() else []
 
 
 def _make_sarif_rule(kind: str) -> dict[str, object]:

@@ -197,12 +197,7 @@ def load_judges(
     """
     task = workbench.make_task(config.task)
     network_of_frame = network if isinstance(network, Mapping) else {}
-    networks: list[Any] = [network]
-    if network is None:
-        networks = list(settings.split_names(config.model))
-    elif network_of_frame:
-        # Each model is loaded once, though it predicts many frames.
-        networks = list(dict.fromkeys(network_of_frame.values()))
+    networks = _list_networks(config, network)
     # The function's type is for `SceneConfig`, which has the same settings of models.
     scene_config: Any = config
     models, warnings = workbench.load_models(networks, task, scene_config)
@@ -216,6 +211,16 @@ def load_judges(
     }
     # The first model predicts frames that the mapping does not have.
     return [ModelJudge(task, models[0], model_of_frame)], warnings
+
+
+def _list_networks(config: TwinsConfig, network: Any) -> list[Any]:
+    """Return the models to load; arguments as for `load_judges`."""
+    if network is None:
+        return list(settings.split_names(config.model))
+    if isinstance(network, Mapping) and network:
+        # Each model is loaded once, though it predicts many frames.
+        return list(dict.fromkeys(network.values()))
+    return [network]
 
 
 def _check_input_sizes(models: Sequence[Model]) -> None:

@@ -434,10 +434,7 @@ def _read_row(row: Mapping[str, Any], path: Path, where: str) -> PhotographedObj
     _check_keys(row, where)
     photograph = _get_file(row, "photograph", path, where)
     mesh = _get_file(row, "object", path, where)
-    # A pose is a matrix (3, 4) or (4, 4). The last row of the latter is 0, 0, 0, 1.
-    numbers = _to_numbers(row["pose"], f"{where}: pose", 12, 16)
-    matrix = np.eye(4)
-    matrix[:3] = numbers[:12].reshape(3, 4)
+    matrix = _read_matrix(row, where)
     unit = str(row.get("unit", "m"))
     if unit not in ("mm", "cm", "m", "in"):
         raise errors.FileFormatError(f"{where}: unit: expected mm, cm, m or in")
@@ -454,6 +451,17 @@ def _read_row(row: Mapping[str, Any], path: Path, where: str) -> PhotographedObj
         mask=_get_file(row, "mask", path, where) if "mask" in row else None,
         where=where,
     )
+
+
+def _read_matrix(row: Mapping[str, Any], where: str) -> Float64Array:
+    """Return the pose of a row as a matrix (4, 4), which may not be valid.
+
+    It is a matrix (3, 4) or (4, 4) in the row. The last row of the latter is 0, 0, 0, 1.
+    """
+    numbers = _to_numbers(row["pose"], f"{where}: pose", 12, 16)
+    matrix = np.eye(4)
+    matrix[:3] = numbers[:12].reshape(3, 4)
+    return matrix
 
 
 def _check_keys(row: Mapping[str, Any], where: str) -> None:

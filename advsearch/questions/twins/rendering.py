@@ -375,20 +375,16 @@ def make_twin(
     visible_coverage = _compute_visible_coverage(item, photograph, window, layer)
     around = crop[visible_coverage < 0.5]
     window_size = (window.height, window.width)
-    in_environments = {
-        name: resize(image, window_size)
-        for name, image in render_of_environment.items()
-    }
     images = {
         PHOTOGRAPH: crop,
         COMPOSED: layer.composed,
-        **in_environments,
+        **_resize_all(render_of_environment, window_size),
         HOLE: _replace_by_mean(crop, around, visible_coverage),
     }
     is_covered = visible_coverage >= 0.5
     difference = (layer.composed - crop)[is_covered]
     return Twin(
-        images={name: resize(image, model_size) for name, image in images.items()},
+        images=_resize_all(images, model_size),
         visible_surface=layer.visible_surface,
         # The full silhouette, with hidden parts, is compared with the data's mask.
         coverage=layer.alpha,
@@ -400,6 +396,13 @@ def make_twin(
             layer.composed[is_covered], crop[is_covered]
         ),
     )
+
+
+def _resize_all(
+    images: Mapping[str, Tensor], size: tuple[int, int]
+) -> dict[str, Tensor]:
+    """Resize images (H, W, C) by name to (height, width)."""
+    return {name: resize(image, size) for name, image in images.items()}
 
 
 def _replace_by_mean(crop: Tensor, around: Tensor, visible_coverage: Tensor) -> Tensor:
