@@ -508,37 +508,75 @@ def run_replay(
     """
     config = context.config
     context.progress.stage(workbench.LOADING)
-    attack_directory = directory.find_run(config.attack)
-    attack = _load_attack(attack_directory)
-    # `RUN_MODEL` stands for the run's own model, which is always used.
-    settings.check_no_duplicates((RUN_MODEL, *config.models), "model")
-    parts = parts or workbench.load_parts_of_run(attack_directory)
-    # a change of the setting `threads`; empty to use as many as the run
-    threads = {} if config.threads is None else {"threads": config.threads}
-    load_problem = partial(workbench.make_problem_with_warnings, parts, **threads)
-    problem, warnings = load_problem()
-    warnings += describe_changed_file(attack_directory, parts)
-
-    spp = verification_spp(attack)
-    conditions = select_conditions(config, problem, spp, load_problem)
+    attack = _load_replayed_attack(config, parts)
+    problem, warnings = attack.load_problem()
+    warnings += describe_changed_file(attack.directory, attack.parts)
+    spp = verification_spp(attack.summary)
+    conditions = select_conditions(config, problem, spp, attack.load_problem)
     if config.backdrop is not None:
-        conditions += photograph_conditions(parts, config.backdrop, spp, threads)
-    u = workbench.read_stored_configuration(attack_directory, problem)
+        conditions += photograph_conditions(
+            attack.parts, config.backdrop, spp, attack.threads
+        )
+    u = workbench.read_stored_configuration(attack.directory, problem)
     # Conditions that share renders are in the same batch, so that each image is
     # rendered once.
     batches = batch_by_renders(conditions, spp)
-    table = _fill_table(context, u, parts.config.seed, batches)
+    table = _fill_table(context, u, attack.parts.config.seed, batches)
     rows = table.list_rows(conditions)
     return context.result(
         ReplayResult,
-        adversarial_run=str(attack_directory),
-        **_list_attack_facts(attack),
+        adversarial_run=str(attack.directory),
+        **_list_attack_facts(attack.summary),
         table=rows,
         transfer=count_transfer(rows, PHOTOGRAPH),
         searched=count_transfer(rows, SEARCHED_PHOTOGRAPH),
         renders=table.renders,
         warnings=warnings,
-        seed=parts.config.seed,
+        seed=attack.parts.config.seed,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _ReplayedAttack:
+    """An attack whose adversarial scene is rendered again.
+
+    Attributes:
+        directory: directory of its run.
+        summary: its summary.
+        parts: its loaded parts.
+        threads: a change of the setting `threads`; empty to use as many as the run.
+    """
+
+    directory: Path
+    summary: workbench.AttackSummary
+    parts: workbench.AttackParts
+    threads: dict[str, Any]
+
+    def load_problem(self, **changes: Any) -> tuple[Problem, list[str]]:
+        """Load its problem, with changes to its settings, and warnings about it."""
+        return workbench.make_problem_with_warnings(
+            self.parts, **{**self.threads, **changes}
+        )
+
+
+def _load_replayed_attack(
+    config: ReplayConfig, parts: workbench.AttackParts | None
+) -> _ReplayedAttack:
+    """Load the attack that the settings name, and check that it can be replayed.
+
+    Args:
+        config: the settings.
+        parts: its loaded parts; None to load what its run names.
+    """
+    attack_directory = directory.find_run(config.attack)
+    summary = _load_attack(attack_directory)
+    # `RUN_MODEL` stands for the run's own model, which is always used.
+    settings.check_no_duplicates((RUN_MODEL, *config.models), "model")
+    return _ReplayedAttack(
+        directory=attack_directory,
+        summary=summary,
+        parts=parts or workbench.load_parts_of_run(attack_directory),
+        threads={} if config.threads is None else {"threads": config.threads},
     )
 
 

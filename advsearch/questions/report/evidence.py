@@ -1311,12 +1311,10 @@ def _make_evidence_run(
     domain = describe_domain(domain_result, recorded_settings, searched)
     conditions = count_conditions(result)
     exposure_lines = describe_exposure(result, conditions, exposure)
-    criterion_lines = []
+    criterion_lines = list[str]()
     if criterion is not None:
-        selected_axes = _list_selected_axes(result, sweeps)
-        criterion_lines = describe_criterion(
-            claims, conditions, criterion, selected_axes
-        )
+        axes = _list_selected_axes(result, sweeps)
+        criterion_lines = describe_criterion(claims, conditions, criterion, axes)
     limitations = _describe_limits(
         claims_of_photographs, domain, is_weighted=bool(exposure_lines)
     )

@@ -235,10 +235,8 @@ def check_scene(
         *_check_finite(renderer, image, result),
         *gradient_checks,
         *_check_bounds(measured, mean, gradient),
+        *_check_ending(result, ending),
     ]
-    if ending:
-        is_expected = result.ending.value == ending
-        checks.append(check_condition(f"the ending is {ending!r}", is_expected))
     if other_scene is not None:
         other_renderer = _make_other_renderer(controls, other_scene)
         checks.append(_compare_images(renderer, start, other_renderer, difference))
@@ -263,6 +261,14 @@ def _make_other_renderer(
 def _are_finite(image: Tensor, gradient: Tensor) -> bool:
     """Return whether no number of an image and of a gradient is NaN or infinite."""
     return bool(torch.isfinite(image).all() and torch.isfinite(gradient).all())
+
+
+def _check_ending(search: workbench.SearchResult, expected: str) -> list[Check]:
+    """Check the status of a search; no check if none is expected."""
+    if not expected:
+        return []
+    is_expected = search.ending.value == expected
+    return [check_condition(f"the ending is {expected!r}", is_expected)]
 
 
 def _check_finite(

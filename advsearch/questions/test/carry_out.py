@@ -97,9 +97,7 @@ def try_suite(
     # if the file has changed since.
     noted_suite = _read_noted_suite(context.resumed_directory)
     loaded_suite = noted_suite or suite or _read_suite(config)
-    added = None
-    if config.add is not None:
-        added = counterexamples.add_counterexample(config.suite, config.add)
+    added = _add_counterexample(config)
     planned, remarks = _plan_checked_claims(
         loaded_suite, config, added, is_from_caller=loaded_suite is suite
     )
@@ -124,6 +122,13 @@ def _check_added(
         raise InputError(
             f"add: the adversarial scene of {config.add} is not stored: {result.reason}"
         )
+
+
+def _add_counterexample(config: SuiteConfig) -> Counterexample | None:
+    """Store the counterexample that the setting `add` names; None without it."""
+    if config.add is None:
+        return None
+    return counterexamples.add_counterexample(config.suite, config.add)
 
 
 def _plan_checked_claims(
@@ -252,13 +257,7 @@ class _SuiteRun:
         with tester.context.until_interrupted():
             for number, claim in enumerate(self.planned, start=1):
                 self._add_result(claim, self._test_claim(claim))
-                last = self.results[-1]
-                tester.progress.message(f"{claim.name}: {last.verdict}: {last.reason}")
-                if number < len(self.planned):
-                    # The summary is written after each claim, so that it can be read
-                    # even if the run is killed: then it states that it was interrupted.
-                    so_far = self.make_result(results.INTERRUPTED, added=None)
-                    tester.run.write_summary(so_far)
+                self._report_last(is_last=number == len(self.planned))
         if tester.context.ending == results.INTERRUPTED:
             self._add_interrupted()
             return results.INTERRUPTED
@@ -269,6 +268,19 @@ class _SuiteRun:
                 "tested; with the setting `all` they are tested, too."
             )
         return results.OUT_OF_TIME if Cause.OUT_OF_TIME in causes else "done"
+
+    def _report_last(self, *, is_last: bool) -> None:
+        """Show the last result, and write a summary unless it is that of the last claim.
+
+        The summary is written after each claim, so that it can be read even if the run
+        is killed: then it states that it was interrupted.
+        """
+        result = self.results[-1]
+        message = f"{result.name}: {result.verdict}: {result.reason}"
+        self.tester.progress.message(message)
+        if not is_last:
+            so_far = self.make_result(results.INTERRUPTED, added=None)
+            self.tester.run.write_summary(so_far)
 
     def _add_interrupted(self) -> None:
         """Add undecided results of the claims that an interrupt left out."""
@@ -515,12 +527,7 @@ def _plan_claims(
         InputError: a claim and a counterexample have the same name, or `only` selects
             nothing or has an unknown name.
     """
-    changes = {
-        "model": config.model,
-        "threads": config.threads,
-        # False is the default, which must not override the suite's setting.
-        "deterministic": config.deterministic or None,
-    }
+    changes = _list_changes(config)
     if added is None:
         examples = counterexamples.read_counterexamples(config.suite)
     else:
@@ -533,6 +540,19 @@ def _plan_claims(
         claim_config = suite.make_config(name, **changes).with_python_parts_of(config)
         planned.append(PlannedClaim(name, suite_claim.claim, claim_config))
     return _select_claims(planned, config)
+
+
+def _list_changes(config: SuiteConfig) -> dict[str, Any]:
+    """Return the settings of the command that override those of a suite, by name.
+
+    None stands for a setting that is not changed.
+    """
+    return {
+        "model": config.model,
+        "threads": config.threads,
+        # False is the default, which must not override the suite's setting.
+        "deterministic": config.deterministic or None,
+    }
 
 
 def _check_example_names(planned: Sequence[PlannedClaim], suite: Suite) -> None:
