@@ -200,6 +200,19 @@ def measure_in_rounds(
     """
     measured = MeasuredRounds()
     timer = _SettingTimer(measured, measure, budget.clock, seed, on_done)
+    _measure_first_round(settings, timer, budget)
+    for _ in range(1, rounds):
+        for setting in measured.results_by_setting:
+            if measured.estimate_call_seconds(setting) <= budget.seconds_left:
+                timer.measure_once(setting)
+    return measured
+
+
+def _measure_first_round(
+    settings: Iterable[SampleSetting], timer: _SettingTimer, budget: TimeBudget
+) -> None:
+    """Measure each setting that fits into the time, and list the others as skipped."""
+    measured = timer.measured
     for setting in sorted(settings, key=lambda setting: setting.relative_cost):
         is_first = not measured.results_by_setting
         if is_first or measured.fits_in_time(setting, budget.seconds_left):
@@ -207,12 +220,6 @@ def measure_in_rounds(
                 timer.measure_once(setting)
         else:
             measured.skipped.append(setting)
-    # The first round is over.
-    for _ in range(1, rounds):
-        for setting in measured.results_by_setting:
-            if measured.estimate_call_seconds(setting) <= budget.seconds_left:
-                timer.measure_once(setting)
-    return measured
 
 
 @dataclass(frozen=True)

@@ -231,8 +231,7 @@ def summarize_samples(
     """
     squares = [numbers["error"] ** 2 for numbers in samples]
     mean_square = statistics.fmean(squares)
-    exceeds_reference = mean_square > (MIN_ERROR_RATIO * reference_error) ** 2
-    is_known = exceeds_reference and math.isfinite(mean_square) and mean_square > 0.0
+    is_known = _is_error_known(mean_square, reference_error)
     error = math.sqrt(mean_square)
     if is_known:
         error = math.sqrt(mean_square - reference_error**2)
@@ -254,6 +253,12 @@ def summarize_samples(
         **_find_median_times(samples),
     }
     return PrecisionPoint.from_values({**vars(setting), **fields})
+
+
+def _is_error_known(mean_square: float, reference_error: float) -> bool:
+    """Return whether a mean square error is clearly larger than that of the reference."""
+    exceeds_reference = mean_square > (MIN_ERROR_RATIO * reference_error) ** 2
+    return exceeds_reference and math.isfinite(mean_square) and mean_square > 0.0
 
 
 def _find_median_times(samples: Sequence[Numbers]) -> dict[str, float]:

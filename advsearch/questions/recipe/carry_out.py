@@ -556,26 +556,32 @@ def _run_parts(
     done = list[DoneRun]()
     left_out = list[str]()
     for number, run in enumerate(runs, start=1):
-        config = run.config
-        progress_line = f"run {number} of {len(runs)}: {run.part_name}, {config.object}"
-        context.progress.message(progress_line)
-        if run.search_run_name is not None:
-            search = _read_search(context, run.search_run_name)
-            if search.distribution is None:
-                left_out.append(_describe_run_without_search(run, search.ending))
-                continue
-            search_ranges = search.configuration or {}
-            config = sample_around(config, search.distribution, search_ranges)
-        result = context.run_part(run.name, config)
+        thing = f"{run.part_name}, {run.config.object}"
+        context.progress.message(f"run {number} of {len(runs)}: {thing}")
+        search = _read_search(context, run.search_run_name)
+        if search is not None and search.distribution is None:
+            left_out.append(_describe_run_without_search(run, search.ending))
+            continue
+        result = context.run_part(run.name, _choose_config(run.config, search))
         done.append((run, result))
         if result.is_unfinished:
             break
     return done, left_out
 
 
-def _read_search(context: RunContext[RecipeConfig], name: str) -> Any:
-    """Read the result of a search that is a run of the recipe."""
+def _read_search(context: RunContext[RecipeConfig], name: str | None) -> Any:
+    """Read the result of a search that is a run of the recipe; None without a name."""
+    if name is None:
+        return None
     return read_result(RunDirectory.locate_part(context.run.path, name))
+
+
+def _choose_config(config: SceneConfig, search: Any) -> SceneConfig:
+    """Return the settings of a run, around the distribution of its search, if any."""
+    if search is None:
+        return config
+    search_ranges = search.configuration or {}
+    return sample_around(config, search.distribution, search_ranges)
 
 
 def _describe_run_without_search(run: PlannedRun, search_ending: str) -> str:

@@ -96,10 +96,7 @@ def read_rows(
     with Store.open_to_read(folder) as store:
         sweep_units = _read_sweep_units(store, summary)
         for row in store.rows():
-            if row.kind not in kinds:
-                continue
-            # An image without the object says nothing about its recognition.
-            if row.kind == "sweep" and row.is_out_of_view:
+            if not _is_counted(row, kinds):
                 continue
             units_of_measure |= {
                 name: stored["unit"] for name, stored in row.values.items()
@@ -109,6 +106,14 @@ def read_rows(
             values |= {"time": row.time, PART_COLUMN: part, "unit": unit}
             rows.append({**values, **more})
     return rows, units_of_measure
+
+
+def _is_counted(row: Any, kinds: Sequence[str]) -> bool:
+    """Return whether a stored row is of one of the kinds, and shows the object."""
+    if row.kind not in kinds:
+        return False
+    # An image without the object says nothing about its recognition.
+    return not (row.kind == "sweep" and row.is_out_of_view)
 
 
 def _read_sweep_units(store: Store, summary: Any) -> Any:

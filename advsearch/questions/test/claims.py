@@ -137,6 +137,12 @@ class _PictureSample:
     verdict: str = UNDECIDED
     worst: _Example | None = None
 
+    def add_score(self, score: float, judgement: tasks.Judgement) -> None:
+        """Add the score of an image that counts, and what is stored if it is wrong."""
+        self.scores.append(score)
+        if not judgement.right:
+            self.wrong_payloads.append(judgement.payload)
+
     def add_example(
         self, violation_score: float, query: workbench.Query, text: str
     ) -> None:
@@ -161,6 +167,17 @@ class _TrialSample:
     wrong_payloads: list[Any] = field(default_factory=list)
     label: str = ""
     picture: str | None = None
+
+    def add_outcome(self, outcome: bool | None, trial: tasks.Judgement) -> bool:
+        """Add the outcome of a trial, and return whether the model is wrong in it.
+
+        The outcome is None for a trial that does not count.
+        """
+        self.outcomes.append(outcome)
+        is_wrong = outcome is False
+        if is_wrong:
+            self.wrong_payloads.append(trial.payload)
+        return is_wrong
 
     @property
     def n_right(self) -> int:
@@ -411,11 +428,8 @@ class ClaimTester:
             if score is None:
                 sample.n_hidden += 1
                 continue
-            judgement = evaluation.required_judgement
-            if not judgement.right:
-                sample.wrong_payloads.append(judgement.payload)
             sequence.add(score)
-            sample.scores.append(score)
+            sample.add_score(score, evaluation.required_judgement)
             is_against_claim = score == 0.0
             if is_against_claim:
                 sample.add_example(violation_score, query, text)
@@ -665,14 +679,10 @@ class ClaimTester:
         for query, trial, clean in self._run_trials(
             journal, kind, u, example.spp, has_conditions=has_conditions
         ):
-            outcome = is_right_in_trial(trial, clean)
-            sample.outcomes.append(outcome)
-            # `outcome` is None for a trial that does not count.
-            if outcome is False:
-                sample.wrong_payloads.append(trial.payload)
-                if not sample.label:
-                    sample.label = trial.prediction.label
-                    sample.picture = self._save_picture(example.name, problem, query)
+            is_wrong = sample.add_outcome(is_right_in_trial(trial, clean), trial)
+            if is_wrong and not sample.label:
+                sample.label = trial.prediction.label
+                sample.picture = self._save_picture(example.name, problem, query)
             if sample.is_enough(has_conditions=has_conditions):
                 break
         return sample
@@ -1090,15 +1100,22 @@ def score_picture(
     other_judgement = other.required_judgement
     other_prediction = other_judgement.prediction
     if isinstance(claim, ChangeClaim):
-        # No image violates such a claim more than another: the first one is reported.
-        text = f"{prediction.label} before and {other_prediction.label} after"
-        is_as_claimed = workbench.meets_claim(claim.claim, prediction, other_prediction)
-        return _PictureScore(float(is_as_claimed), text=text)
+        return _score_change(claim, prediction, other_prediction)
     # Images of different sizes may differ in whether the object is visible.
     if other_prediction.is_out_of_view:
         return _PictureScore(None)
     difference = int(judgement.right) - int(other_judgement.right)  # -1, 0 or 1
     return _PictureScore((difference + 1) / 2)
+
+
+def _score_change(
+    claim: ChangeClaim, before: tasks.Prediction, after: tasks.Prediction
+) -> _PictureScore:
+    """Score an image by the predictions before and after a change."""
+    # No image violates such a claim more than another: the first one is reported.
+    text = f"{before.label} before and {after.label} after"
+    is_as_claimed = workbench.meets_claim(claim.claim, before, after)
+    return _PictureScore(float(is_as_claimed), text=text)
 
 
 def _score_alone(judgement: tasks.Judgement) -> _PictureScore:
