@@ -384,17 +384,22 @@ class QuantityMeasurer:
         )
         # one recommendation, since the gradient of this part is the only quantity here
         (recommended,) = self.recommend(sitting.points, confirmations=[])
-        warnings = []
-        if budget.seconds_left > 0.0:
-            bias_warning = bench.check_bias(self._seed)
-            if bias_warning:
-                warnings.append(bias_warning)
+        warnings = self._list_bias_warnings(bench, budget)
         further_values = {
             "confirmations": self._measure_again(title, bench, recommended, budget),
             "warnings": warnings,
             "seconds": time.perf_counter() - start_time,
         }
         return sitting.model_copy(update=further_values)
+
+    def _list_bias_warnings(
+        self, bench: GradientBench, budget: TimeBudget
+    ) -> list[str]:
+        """Return a warning if the reference is biased; empty if no time is left."""
+        if not budget.seconds_left > 0.0:
+            return []
+        bias_warning = bench.check_bias(self._seed)
+        return [bias_warning] if bias_warning else []
 
     def _measure_again(
         self,

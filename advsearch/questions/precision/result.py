@@ -679,6 +679,17 @@ def _draw_theory(axes: Any, points: Sequence[PrecisionPoint]) -> None:
     # slope
     smallest_scale = min(point.rms_error * math.sqrt(point.seconds) for point in points)
     scale = PERCENT * smallest_scale * 0.8  # a little under that point
+    _draw_half_slope(axes, start, end, scale)
+
+
+def _draw_half_slope(axes: Any, start: float, end: float, scale: float) -> None:
+    """Draw the dashed line error = scale / sqrt(seconds), with its slope.
+
+    Args:
+        axes: axes of matplotlib, logarithmic.
+        start, end: the seconds that it spans.
+        scale: error in percent at one second.
+    """
     axes.plot(
         [start, end],
         [scale / math.sqrt(start), scale / math.sqrt(end)],

@@ -271,20 +271,17 @@ class RegionSearch:
         The verdict is whether the model is right or wrong at the center. In the box the
         verdict is the same.
         """
-        config = self._config
         verifier = self._verifier
         varied = self._varied
         # Choose enough samples per pixel that noise does not decide the prediction at
         # the center.
         verifier.choose_spp({"centre": varied.center})
         self._is_wrong_at_center = find_verdict(verifier, varied.center)
-        if config.specialise:
+        if self._config.specialise:
             self._prepare_light()
         grown = self._grow_box()
         sides = describe_box(verifier.problem, grown, varied)
-        margin_map = None
-        if config.map:
-            margin_map = draw_map(verifier, config.map, varied, sides, self._run)
+        margin_map = self._draw_map_of(sides)
         return GrownRegion(
             verdict="wrong" if self._is_wrong_at_center else "right",
             box=sides,
@@ -296,6 +293,13 @@ class RegionSearch:
             spp=verifier.run_state.spp,
             map=margin_map,
         )
+
+    def _draw_map_of(self, sides: Sequence[BoxSide]) -> MarginMap | None:
+        """Draw the map with the sides of the box; None without the setting `map`."""
+        size = self._config.map
+        if not size:
+            return None
+        return draw_map(self._verifier, size, self._varied, sides, self._run)
 
     def _prepare_light(self) -> None:
         """Prepare the light on surfaces, so that images can be predicted.

@@ -212,13 +212,7 @@ class Cycles:
                 cannot be exported to Blender.
         """
         self._command = _find_blender_command()
-        unsupported = _find_unsupported(description)
-        if unsupported:
-            raise BlenderError(
-                # Five names are enough for a message.
-                f"the scene has {', '.join(unsupported[:5])}, which is not "
-                "carried over to Blender"
-            )
+        _check_supported(description)
         self._description = description
         self._resolution = size
         self._depth = max_depth
@@ -377,6 +371,17 @@ def _get_number(values: Mapping[str, Tensor], name: str, default: float) -> floa
         default: the number if there is no such input.
     """
     return float(values.get(name, torch.tensor([default]))[0])
+
+
+def _check_supported(description: SceneDescription) -> None:
+    """Raise an error if a scene has parts that cannot be transferred to Blender."""
+    unsupported = _find_unsupported(description)
+    if unsupported:
+        raise BlenderError(
+            # Five names are enough for a message.
+            f"the scene has {', '.join(unsupported[:5])}, which is not "
+            "carried over to Blender"
+        )
 
 
 def _find_unsupported(description: SceneDescription) -> list[str]:

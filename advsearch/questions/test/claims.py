@@ -644,12 +644,9 @@ class ClaimTester:
             has_conditions=has_conditions
         )
         if is_late:
-            reasons = [OUT_OF_TIME_REASON]
-            if sample.outcomes:  # the reason states what these trials were
-                reasons = [update["reason"], OUT_OF_TIME_REASON]
-            late_reason = "; ".join(reasons)
-            update |= {"verdict": UNDECIDED, "reason": late_reason}
-            update |= {"cause": Cause.OUT_OF_TIME}
+            # The reason states what the trials were, if there were any.
+            reasons = [update["reason"]] if sample.outcomes else []
+            update |= _make_late_fields(reasons)
         update |= {"picture": sample.picture, "spp": example.spp}
         return untested_result.model_copy(update=update)
 
@@ -839,6 +836,19 @@ def _explain_change(
             "new run"
         )
     return ""
+
+
+def _make_late_fields(reasons: Sequence[str]) -> dict[str, Any]:
+    """Return the fields of a result whose test ended since the time was over.
+
+    Args:
+        reasons: what is known about it.
+    """
+    return {
+        "verdict": UNDECIDED,
+        "reason": "; ".join([*reasons, OUT_OF_TIME_REASON]),
+        "cause": Cause.OUT_OF_TIME,
+    }
 
 
 def _count_trial_renders(*, has_conditions: bool) -> int:

@@ -809,19 +809,28 @@ def read_expected(suite: str) -> dict[str, str]:
     path = counterexample_directory(suite) / EXPECTED_FILE
     if not path.is_file():
         return {}
-    try:
-        text = stored_files.read_text(path, "what is expected of a suite", MAX_SIZE)
-        values = stored_files.parse_json(text)
-    except (OSError, ValueError) as error:
-        raise errors.FileFormatError(
-            f"{path}: expected verdicts by claim, got {str(error)[:80]}; remove it"
-        ) from None
+    values = _read_expected_json(path)
     verdicts = values.get("expected") if isinstance(values, dict) else None
     if not _are_verdicts(verdicts):
         raise errors.FileFormatError(
             f"{path}: expected verdicts by claim, got something else; remove it"
         )
     return {str(name): str(verdict) for name, verdict in verdicts.items()}
+
+
+def _read_expected_json(path: Path) -> Any:
+    """Read the content of the file with expected verdicts, unchecked.
+
+    Raises:
+        FileFormatError: the file is no JSON.
+    """
+    try:
+        text = stored_files.read_text(path, "what is expected of a suite", MAX_SIZE)
+        return stored_files.parse_json(text)
+    except (OSError, ValueError) as error:
+        raise errors.FileFormatError(
+            f"{path}: expected verdicts by claim, got {str(error)[:80]}; remove it"
+        ) from None
 
 
 def _are_verdicts(values: Any) -> TypeGuard[dict[Any, Any]]:

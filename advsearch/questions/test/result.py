@@ -223,14 +223,16 @@ def describe_claim(claim: AnyClaim, config: SceneConfig) -> str:
     if isinstance(claim, ChangeClaim):
         return f"{model} says {_describe_expected_change(claim)}: {subject}"
     if isinstance(claim, NoWorseClaim):
-        points = f"{wording.format_number(claim.points)} points"
-        other = wording.shorten_name(claim.than)
-        return (
-            f"{model} is right at most {points} less often than {other} "
-            f"on the same pictures of {subject}"
-        )
+        comparison = _describe_expected_difference(claim)
+        return f"{model} is right {comparison} on the same pictures of {subject}"
     budget = _describe_epsilon(config)
     return f"no search finds a picture that {model} gets wrong: {subject}{budget}"
+
+
+def _describe_expected_difference(claim: NoWorseClaim) -> str:
+    """Describe by how much a model may be right less often than another one."""
+    points = f"{wording.format_number(claim.points)} points"
+    return f"at most {points} less often than {wording.shorten_name(claim.than)}"
 
 
 def _describe_expected_change(claim: ChangeClaim) -> str:
@@ -366,13 +368,18 @@ def evaluate_search(
             f"{verified.trials} trials: it depends on the noise"
         )
         return SearchVerdict(UNDECIDED, reason)
-    # Without a time limit, a search that makes fewer steps has ended by itself.
-    max_steps = config.steps
-    has_time_limit = config.seconds is not None
-    if has_time_limit and max_steps is not None and summary.steps < max_steps:
-        reason = f"{OUT_OF_TIME_REASON} after {summary.steps} of {max_steps} steps"
+    if _was_cut_short(summary, config):
+        reason = f"{OUT_OF_TIME_REASON} after {summary.steps} of {config.steps} steps"
         return SearchVerdict(UNDECIDED, reason, Cause.OUT_OF_TIME)
     return SearchVerdict(HELD, _describe_unbroken(summary))
+
+
+def _was_cut_short(summary: workbench.AttackSummary, config: AttackConfig) -> bool:
+    """Return whether a time limit ended a search before it made all of its steps."""
+    # Without a time limit, a search that makes fewer steps has ended by itself.
+    if config.seconds is None or config.steps is None:
+        return False
+    return summary.steps < config.steps
 
 
 def _describe_verified(task: str, verified: results.VerifiedRate) -> str:

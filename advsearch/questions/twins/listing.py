@@ -251,14 +251,7 @@ class _BopScene:
         photograph = _find_photograph(self.directory, int(image))
         if photograph is None:
             return None
-        shared: dict[str, Any] = {
-            "photograph": photograph,
-            "frame": f"{self.directory.name}/{image}",
-            "camera": _read_bop_camera(self.directory, self.cameras, image),
-            "unit": "mm",
-            "condition": self.condition,
-            "where": where,
-        }
+        shared = self._read_shared_values(image, photograph, where)
         infos = self.infos.get(image)
         return [
             PhotographedObject(
@@ -268,6 +261,25 @@ class _BopScene:
             )
             for index, entry in enumerate(entries)
         ]
+
+    def _read_shared_values(
+        self, image: str, photograph: Path, where: str
+    ) -> dict[str, Any]:
+        """Return the fields that all objects of an image share.
+
+        Args:
+            image: number of the image, as text.
+            photograph: its photograph.
+            where: location in the ground truth, for messages.
+        """
+        return {
+            "photograph": photograph,
+            "frame": f"{self.directory.name}/{image}",
+            "camera": _read_bop_camera(self.directory, self.cameras, image),
+            "unit": "mm",
+            "condition": self.condition,
+            "where": where,
+        }
 
 
 def _read_bop_silhouette(
