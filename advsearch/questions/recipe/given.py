@@ -587,16 +587,20 @@ def make_ternary_figure(rows: Rows, options: TernaryOptions) -> FigureContent:
         text, heads, table = _describe_ingredients(
             rows, ranking, names, main_ingredient
         )
-    panels = _make_panels(rows, ranking, by_margin, in_triangle)
-    corners = list(corners_of_triangle.values())
-    diagrams = _TernaryDiagrams(panels, corners, names, by_margin, options.normalised)
+    diagrams = _TernaryDiagrams(
+        panels=_make_panels(rows, ranking, by_margin, in_triangle),
+        corners=list(corners_of_triangle.values()),
+        names=names,
+        by_margin=by_margin,
+        normalised=options.normalised,
+    )
     return FigureContent(
         title=f"Predictions over {', '.join(names)}",
         text=text + _describe_empty(in_triangle),
         columns=heads,
         rows=table,
         draw=diagrams.draw,
-        size=(max(2.4 * len(panels), 4.8), 3.5),
+        size=(max(2.4 * len(diagrams.panels), 4.8), 3.5),
     )
 
 

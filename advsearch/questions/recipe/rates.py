@@ -614,8 +614,8 @@ class _RatesContent:
     @property
     def baseline_name(self) -> str:
         """The name of the part that all others are compared with; empty without one."""
-        beside = self.options.beside or ""
-        return self.options.names.get(beside, beside)
+        part = self.options.beside or ""
+        return self.options.names.get(part, part)
 
     @property
     def bars(self) -> Cells:

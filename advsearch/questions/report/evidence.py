@@ -1307,18 +1307,16 @@ def _make_evidence_run(
     searched = _list_searched(folder, result, sweeps) or run.searched
     # A result that was made from sweeps is about their domain, which is the same for
     # all of them: so the first is described.
-    domain_result = sweeps[0].result if sweeps else result
-    domain = describe_domain(domain_result, recorded_settings, searched)
+    domain = describe_domain(
+        sweeps[0].result if sweeps else result, recorded_settings, searched
+    )
     conditions = count_conditions(result)
     exposure_lines = describe_exposure(result, conditions, exposure)
     criterion_lines = list[str]()
     if criterion is not None:
         axes = _list_selected_axes(result, sweeps)
         criterion_lines = describe_criterion(claims, conditions, criterion, axes)
-    limitations = _describe_limits(
-        claims_of_photographs, domain, is_weighted=bool(exposure_lines)
-    )
-    update = {
+    further_values = {
         "searched": searched,
         "excluded": [*_list_quick_remarks(folder), *run.excluded],
         "criterion": criterion_lines,
@@ -1327,10 +1325,24 @@ def _make_evidence_run(
         "conditions": conditions,
         "photographs": count_conditions(result, photo_rows),
         "twins": _find_twins(folder, result, twins),
+        **_describe_bounds(claims_of_photographs, domain, exposure_lines),
+    }
+    return run.model_copy(update=further_values)
+
+
+def _describe_bounds(
+    claims_of_photographs: Sequence[views.Claim],
+    domain: Mapping[str, DomainPart],
+    exposure_lines: Sequence[str],
+) -> dict[str, object]:
+    """Return the domain of a run, and what must not be concluded from it, as fields."""
+    limitations = _describe_limits(
+        claims_of_photographs, domain, is_weighted=bool(exposure_lines)
+    )
+    return {
         "domain": {name: part.text for name, part in domain.items()},
         "limitations": limitations,
     }
-    return run.model_copy(update=update)
 
 
 def _find_twins(

@@ -494,18 +494,34 @@ def measure_inward_slope(
     inwards = torch.where(u > 0.5, -1.0, 1.0)  # down from 1, up from 0
     increases_loss = gradient * (0.5 - u) > 0.0  # 0.5 - u points inwards, too
     direction = inwards * increases_loss * factor
-    step = 0.04  # in units of the range, small but above the noise
-    # the bound, and one and two steps from it
-    points = [u + count * step * direction for count in range(3)]
     loss = gradients.make_smooth_loss(linear.formation.resolution)
-    slopes = []
-    for seed in range(seeds):
-        images = [render_image(linear, point, seed, spp) for point in points]
-        at_0, at_1, at_2 = (float(loss(image)) for image in images)
-        # f'(0) = (4 f(h) - 3 f(0) - f(2h)) / (2h) + O(h^2), the forward difference of
-        # second order
-        slopes.append((4.0 * at_1 - 3.0 * at_0 - at_2) / (2.0 * step))
+
+    def compute_loss(seed: int, configuration: Tensor) -> float:
+        """Return the loss at a configuration (d,), with the noise of a seed."""
+        return float(loss(render_image(linear, configuration, seed, spp)))
+
+    slopes = [
+        _compute_forward_slope(partial(compute_loss, seed), u, direction)
+        for seed in range(seeds)
+    ]
     return float(gradient @ direction), math.fsum(slopes) / seeds
+
+
+def _compute_forward_slope(
+    value: Callable[[Tensor], float], u: Tensor, direction: Tensor
+) -> float:
+    """Compute the derivative of a value by a forward difference of second order.
+
+    Args:
+        value: function of the configuration.
+        u: (d,) the configuration.
+        direction: (d,) direction of the derivative.
+    """
+    step = 0.04  # in units of the range, small but above the noise
+    # values at the bound, and one and two steps from it
+    at_0, at_1, at_2 = (value(u + count * step * direction) for count in range(3))
+    # f'(0) = (4 f(h) - 3 f(0) - f(2h)) / (2h) + O(h^2)
+    return (4.0 * at_1 - 3.0 * at_0 - at_2) / (2.0 * step)
 
 
 def evaluate(
