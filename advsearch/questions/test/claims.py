@@ -369,18 +369,11 @@ class ClaimTester:
         )
         if is_late:
             reason += f"; {OUT_OF_TIME_REASON}"
-        rate = None
-        if sample.scores:
-            # a tuple with one converted number for each argument
-            (rate,) = _to_claim_scale(claim, sequence.mean)
         update = {
-            "verdict": sample.verdict,
+            **_make_sample_fields(claim, sample, sequence),
             "reason": reason,
             "cause": Cause.OUT_OF_TIME if is_late else None,
-            "interval": _to_claim_scale(claim, *sequence.interval),
-            "pictures": len(sample.scores),
             "spp": samples_per_pixel(config),
-            "rate": rate,
             "picture": picture,
         }
         return untested_result.model_copy(update=update)
@@ -784,6 +777,30 @@ def _count_rendered(summary: workbench.AttackSummary) -> int:
     # "products" are images that were computed by matrices of light transport, and
     # not rendered.
     return sum(count for name, count in summary.renders.items() if name != "products")
+
+
+def _make_sample_fields(
+    claim: ShareClaim | NoWorseClaim,
+    sample: _PictureSample,
+    sequence: statistics.sequential.ConfidenceSequence,
+) -> dict[str, object]:
+    """Return the numbers of a `ClaimResult` that follow from sampled images.
+
+    Args:
+        claim: what is claimed.
+        sample: the images.
+        sequence: confidence sequence of the mean score.
+    """
+    rate = None
+    if sample.scores:
+        # a tuple with one converted number for each argument
+        (rate,) = _to_claim_scale(claim, sequence.mean)
+    return {
+        "verdict": sample.verdict,
+        "interval": _to_claim_scale(claim, *sequence.interval),
+        "pictures": len(sample.scores),
+        "rate": rate,
+    }
 
 
 def _make_evaluators(

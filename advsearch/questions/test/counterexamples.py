@@ -166,12 +166,10 @@ class _Block(BaseModel):
         is_small = len(values) <= MAX_FINE_VALUES
         stores_signs = signs and not is_small
         step = _choose_quantum(values, is_small=is_small, stores_signs=stores_signs)
-        # A texture has side * side texels of 3 values.
-        side = isqrt(len(values) // 3)
-        is_texture = not is_small and 3 * side * side == len(values)
-        if not is_texture or side % square != 0:
-            square = 1
         square_values = values
+        side = isqrt(len(values) // 3)  # if it is a texture
+        if is_small or not _has_squares(len(values), square):
+            square = 1
         if square > 1:
             square_values = _average_squares(values, side, square)
         # little-endian 16-bit integers, the same on all machines
@@ -244,6 +242,13 @@ def _choose_quantum(values: Floats, *, is_small: bool, stores_signs: bool) -> fl
         # all offsets are 0, the step may be any positive number.
         return float(np.abs(values).max()) or 1.0
     return COARSE_STEP
+
+
+def _has_squares(n_values: int, square: int) -> bool:
+    """Return whether values are a texture (side, side, 3) that squares of texels tile."""
+    # A texture has side * side texels of 3 values.
+    side = isqrt(n_values // 3)
+    return 3 * side * side == n_values and side % square == 0
 
 
 def _average_squares(values: Floats, side: int, square: int) -> Floats:
