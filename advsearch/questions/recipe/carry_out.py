@@ -752,12 +752,9 @@ def _read_frame(
     for run, result in done:
         if isinstance(run.config, SweepConfig) and result.surface:
             surfaces[run.name] = result.surface
-        for part, kinds in _list_row_kinds(run).items():
-            part_rows, part_units = _read_run_rows(
-                run, result, recipe_run, part=part, kinds=kinds
-            )
-            rows += part_rows
-            units |= part_units
+        run_rows, run_units = _read_run_rows(run, result, recipe_run)
+        rows += run_rows
+        units |= run_units
     return make_frame(
         rows,
         recipe.groups,
@@ -779,32 +776,28 @@ def _list_row_kinds(run: PlannedRun) -> dict[str, Sequence[str]]:
 
 
 def _read_run_rows(
-    run: PlannedRun,
-    result: Any,
-    recipe_run: RunDirectory,
-    *,
-    part: str,
-    kinds: Sequence[str],
+    run: PlannedRun, result: Any, recipe_run: RunDirectory
 ) -> tuple[list[dict[str, Any]], dict[str, str]]:
-    """Read the rows of a run that count for a part, and the units of their columns.
+    """Read the rows of a run, each with its part, and the units of their columns.
 
     Args:
         run: the finished run.
         result: its result.
         recipe_run: run directory of the recipe.
-        part: name of the part, which the column "part" gets.
-        kinds: kinds of stored rows to read.
     """
+    rows = list[dict[str, Any]]()
+    units = dict[str, str]()
     workers = getattr(run.config, WORKERS_COLUMN, None)
     more_columns = {} if workers is None else {WORKERS_COLUMN: workers}
-    return read_rows(
-        part,
-        RunDirectory.locate_part(recipe_run.path, run.name),
-        summary=result,
-        seed=run.config.seed,
-        kinds=kinds,
-        **more_columns,
-    )
+    folder = RunDirectory.locate_part(recipe_run.path, run.name)
+    seed = run.config.seed
+    for part, kinds in _list_row_kinds(run).items():
+        part_rows, part_units = read_rows(
+            part, folder, summary=result, seed=seed, kinds=kinds, **more_columns
+        )
+        rows += part_rows
+        units |= part_units
+    return rows, units
 
 
 def read_figure_options(

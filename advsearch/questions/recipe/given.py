@@ -367,25 +367,43 @@ def _draw_cues(
     """
     axes = figure.subplots()
     ordered = sorted(by_shape, key=lambda name: by_shape[name].fraction or 0.0)
-    shape_shares = [by_shape[name].fraction or 0.0 for name in ordered]
-    texture_shares = [by_texture[name].fraction or 0.0 for name in ordered]
-    style = {"alpha": 0.55, "height": 0.66}
-    axes.barh(ordered, shape_shares, color=figures.BLUE, label="the object", **style)
-    axes.barh(
-        ordered,
-        texture_shares,
-        left=shape_shares,
-        color=figures.RED,
-        label="the texture",
-        **style,
-    )
-    _draw_intervals(axes, [by_shape[name] for name in ordered])
+    shape_tallies = [by_shape[name] for name in ordered]
+    _draw_named(axes, ordered, shape_tallies, [by_texture[name] for name in ordered])
+    _draw_intervals(axes, shape_tallies)
     axes.set(
         xlabel="share of predictions; line: 95 % interval of the object's",
         xlim=(0.0, 1.0),
     )
     axes.grid(True, axis="x")
     figure.legend(loc="outside lower center", ncols=2, title="the prediction names")
+
+
+def _draw_named(
+    axes: Any,
+    textures: Sequence[str],
+    shape_tallies: Sequence[ClusteredFraction],
+    texture_tallies: Sequence[ClusteredFraction],
+) -> None:
+    """Draw a stacked bar of both fractions for each texture.
+
+    Args:
+        axes: axes of matplotlib.
+        textures: names of the textures.
+        shape_tallies: for each, how often the prediction names the object.
+        texture_tallies: for each, how often the prediction names the texture.
+    """
+    shape_shares = [tally.fraction or 0.0 for tally in shape_tallies]
+    texture_shares = [tally.fraction or 0.0 for tally in texture_tallies]
+    style = {"alpha": 0.55, "height": 0.66}
+    axes.barh(textures, shape_shares, color=figures.BLUE, label="the object", **style)
+    axes.barh(
+        textures,
+        texture_shares,
+        left=shape_shares,
+        color=figures.RED,
+        label="the texture",
+        **style,
+    )
 
 
 def _draw_intervals(axes: Any, tallies: Sequence[ClusteredFraction]) -> None:
@@ -580,13 +598,9 @@ def make_ternary_figure(rows: Rows, options: TernaryOptions) -> FigureContent:
     margins = _group_margins(rows, names, main_ingredient)
     by_margin = _shows_margins(ranking, margins)
     ranking = ranking[: options.most]
-    if by_margin:
-        # The ranking has a single label, with its count.
-        text, heads, table = _describe_margins(ranking[0][0], margins)
-    else:
-        text, heads, table = _describe_ingredients(
-            rows, ranking, names, main_ingredient
-        )
+    text, heads, table = _describe_mixtures(
+        rows, ranking, names, main_ingredient, margins if by_margin else None
+    )
     diagrams = _TernaryDiagrams(
         panels=_make_panels(rows, ranking, by_margin, in_triangle),
         corners=list(corners_of_triangle.values()),
@@ -602,6 +616,32 @@ def make_ternary_figure(rows: Rows, options: TernaryOptions) -> FigureContent:
         draw=diagrams.draw,
         size=(max(2.4 * len(diagrams.panels), 4.8), 3.5),
     )
+
+
+def _describe_mixtures(
+    rows: Rows,
+    ranking: Sequence[tuple[str, int]],
+    names: Sequence[str],
+    main_ingredient: npt.NDArray[np.intp],
+    margins: Mapping[str, Float64Array] | None,
+) -> tuple[list[str], list[str], list[list[rates.Cell]]]:
+    """Describe predictions, or the margins of a single one, by the main ingredient.
+
+    Args:
+        rows: rows of one mixture each.
+        ranking: the predictions with their counts, the most frequent first.
+        names: names of the ingredients.
+        main_ingredient: (n,) index of the largest ingredient in each row.
+        margins: margins by the main ingredient; None to describe predictions.
+
+    Returns:
+        Sentences, and the heads and rows of a table.
+    """
+    if margins is None:
+        return _describe_ingredients(rows, ranking, names, main_ingredient)
+    # The ranking has a single label, with its count.
+    label, _ = ranking[0]
+    return _describe_margins(label, margins)
 
 
 def _shows_margins(

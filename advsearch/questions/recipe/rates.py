@@ -1607,14 +1607,9 @@ def _draw_scaling(
     """
     axes = figure.subplots()
     counts = list(rates_by_count)
-    fewest, slowest = next(iter(rates_by_count.items()))
-    linear = [slowest.median() / fewest * workers for workers in counts]
-    axes.plot(
-        counts,
-        linear,
-        color="0.7",
-        label=f"linear, from {wording.format_count(fewest, 'worker')}",
-    )
+    linear = _compute_linear_rates(rates_by_count)
+    label = f"linear, from {wording.format_count(counts[0], 'worker')}"
+    axes.plot(counts, linear, color="0.7", label=label)
     _draw_throughputs(axes, rates_by_count)
     axes.set_xticks(counts, list(map(str, counts)))
     axes.set(
@@ -1624,6 +1619,12 @@ def _draw_scaling(
     )
     axes.grid(True, axis="y")
     figure.legend(loc="outside lower center", ncols=2)
+
+
+def _compute_linear_rates(rates_by_count: Mapping[int, Any]) -> list[float]:
+    """Compute the rate of each worker count if it grew linearly from the fewest."""
+    fewest, slowest = next(iter(rates_by_count.items()))
+    return [slowest.median() / fewest * workers for workers in rates_by_count]
 
 
 def _draw_throughputs(axes: Any, rates_by_count: Mapping[int, Any]) -> None:
