@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from collections import defaultdict
@@ -103,21 +104,23 @@ def run_recipe(context: RunContext[RecipeConfig]) -> RecipeResult:
     _check_photograph_folder(context.config)
     recipe = _load_recipe(context)
     runs = _plan_checked_runs(recipe, context)
-    # For a resumed run this writes the same note again.
-    recipe_note = json.dumps(recipe.model_dump(mode="json"))
-    context.run.store.write_note(RECIPE_NOTE, recipe_note)
-
+    _write_recipe_note(recipe, context)
     done, warnings = _run_parts(runs, context)
     if any(result.is_unfinished for _, result in done):
         context.ending = results.INTERRUPTED
     else:
         warnings += _compare_photographs(recipe, done, context)
-    recipe_figures = list[RecipeFigure]()
-    if context.ending != results.INTERRUPTED:
-        recipe_figures = list(_write_figures(recipe, context.config, done, context.run))
+    recipe_figures = list(_write_figures(recipe, done, context))
     for _, result in done:
         warnings += getattr(result, "warnings", ())
     return _make_result(recipe, done, recipe_figures, warnings, context)
+
+
+def _write_recipe_note(recipe: Recipe, context: RunContext[RecipeConfig]) -> None:
+    """Note the recipe in the run's store, from which a resumed run reads it."""
+    # For a resumed run this writes the same note again.
+    recipe_note = json.dumps(recipe.model_dump(mode="json"))
+    context.run.store.write_note(RECIPE_NOTE, recipe_note)
 
 
 def _check_photograph_folder(config: RecipeConfig) -> None:
@@ -398,17 +401,32 @@ def check_figures(
     for index, described in enumerate(recipe.figures, start=1):
         kind, options = read_figure_options(described, where)
         location = f"It stands in {where}, figure {index} ({kind})"
-        # The part that all others are compared with needs none of the columns.
-        baseline = getattr(options, "beside", None)
-        _check_option_parts(recipe, options, baseline, location)
-        parts = options.of or tuple(columns)  # by default all parts
-        columns_of_part = {
-            part: part_columns
-            for part, part_columns in columns.items()
-            if part in parts and part != baseline
-        }
-        if columns_of_part:  # otherwise it shows only the baseline or photographs
-            _check_option_columns(recipe, options, columns_of_part, location)
+        _check_figure(recipe, options, columns, location)
+
+
+def _check_figure(
+    recipe: Recipe,
+    options: Options,
+    columns: Mapping[str, Collection[str]],
+    location: str,
+) -> None:
+    """Check that the parts and columns that the options of a figure name exist.
+
+    Args:
+        recipe: the recipe.
+        options: options of the figure.
+        columns: names of columns by part.
+        location: location of the figure, for messages.
+    """
+    # The part that all others are compared with needs none of the columns.
+    baseline = getattr(options, "beside", None)
+    _check_option_parts(recipe, options, baseline, location)
+    parts = options.of or tuple(columns)  # by default all parts
+    columns_of_part = {
+        part: columns[part] for part in columns if part in parts and part != baseline
+    }
+    if columns_of_part:  # otherwise it shows only the baseline or photographs
+        _check_option_columns(recipe, options, columns_of_part, location)
 
 
 def _check_option_columns(
@@ -425,17 +443,20 @@ def _check_option_columns(
         columns_of_part: names of columns of each part of the figure.
         location: location of the figure, for messages.
     """
+    common = _list_common_columns(recipe)
     for option in COLUMN_OPTIONS:
         value = getattr(options, option, None) or ()  # a name, or several
         names = [value] if isinstance(value, str) else value
         for name in names:
-            _check_column(
-                recipe,
-                name,
-                option=option,
-                columns_of_part=columns_of_part,
-                location=location,
-            )
+            _check_column(name, option, common, columns_of_part, location)
+
+
+def _list_common_columns(recipe: Recipe) -> set[str]:
+    """Return the names of the columns that all parts of a recipe have."""
+    common = set(COMMON_COLUMNS)
+    if recipe.groups:
+        common.add(rates.GROUP_COLUMN)
+    return common
 
 
 def _check_option_parts(
@@ -461,33 +482,30 @@ def _check_option_parts(
 
 
 def _check_column(
-    recipe: Recipe,
     name: str,
     option: str,
+    common: Collection[str],
     columns_of_part: Mapping[str, Collection[str]],
     location: str,
 ) -> None:
     """Check that all parts of a figure have a column.
 
     Args:
-        recipe: the recipe; if it has groups, all parts have a column of the group.
         name: name of the column.
         option: option of the figure that names the column.
+        common: names of the columns that all parts have.
         columns_of_part: names of columns of each part of the figure.
         location: location of the figure, for messages.
 
     Raises:
         InputError: if no part has it, or only some have.
     """
-    common = set(COMMON_COLUMNS)  # columns that all parts have
-    if recipe.groups:
-        common.add(rates.GROUP_COLUMN)
     if name in common:
         return
     lacking = _list_parts_without(name, columns_of_part)
     if len(lacking) == len(columns_of_part):
         # the columns that any part has, for the message
-        known = common.union(*columns_of_part.values())
+        known = set(common).union(*columns_of_part.values())
         raise _make_unknown_column_error(name, known, f"{location}, as `{option}`.")
     if lacking:
         raise InputError(
@@ -556,8 +574,7 @@ def _run_parts(
     done = list[DoneRun]()
     left_out = list[str]()
     for number, run in enumerate(runs, start=1):
-        thing = f"{run.part_name}, {run.config.object}"
-        context.progress.message(f"run {number} of {len(runs)}: {thing}")
+        _report_run(run, f"run {number} of {len(runs)}", context)
         search = _read_search(context, run.search_run_name)
         if search is not None and search.distribution is None:
             left_out.append(_describe_run_without_search(run, search.ending))
@@ -567,6 +584,13 @@ def _run_parts(
         if result.is_unfinished:
             break
     return done, left_out
+
+
+def _report_run(
+    run: PlannedRun, number: str, context: RunContext[RecipeConfig]
+) -> None:
+    """Report that a run begins: ``run 2 of 5: search, mug``; `number` comes first."""
+    context.progress.message(f"{number}: {run.part_name}, {run.config.object}")
 
 
 def _read_search(context: RunContext[RecipeConfig], name: str | None) -> Any:
@@ -614,12 +638,9 @@ def sample_around(
     ):
         control, _, parameter_name = name.partition(".")
         search_range = (search_ranges[name].low, search_ranges[name].high)
-        controls.setdefault(control, {})[parameter_name] = _range_around(
-            mean.value,
-            deviation,
-            search_range,
-            _find_parameter(control, parameter_name),
-        )
+        parameter = _find_parameter(control, parameter_name)
+        sampled_range = _range_around(mean.value, deviation, search_range, parameter)
+        controls.setdefault(control, {})[parameter_name] = sampled_range
     return config.model_copy(update={"controls": controls, "sampler": "random"})
 
 
@@ -651,12 +672,10 @@ def _range_around(
     is_full_turn = parameter.periodic and upper - lower >= FULL_TURN
     if is_full_turn:  # an angle beyond the bounds is the same as one within them
         half_width = min(half_width, FULL_TURN / 2)
-        bounds = [center - half_width, center + half_width]
-    else:
-        bounds = [max(center - half_width, lower), min(center + half_width, upper)]
-    if parameter.log:
-        return [math.exp(bound) for bound in bounds]
-    return bounds
+        lower, upper = -math.inf, math.inf  # not clipped
+    bounds = [max(center - half_width, lower), min(center + half_width, upper)]
+    from_scale = math.exp if parameter.log else float
+    return [from_scale(bound) for bound in bounds]
 
 
 def _add_photographs(
@@ -681,8 +700,9 @@ def _add_photographs(
         object_name = planned_run.config.object
         directory = folder / Path(object_name).stem
         files = photographs.list_files(directory, planned_run.config.task)
-        part = RunDirectory.locate_part(run.path, planned_run.name)
-        photographs.add_files(part, files)
+        photographs.add_files(
+            RunDirectory.locate_part(run.path, planned_run.name), files
+        )
         if not files:
             missing.append(f"{object_name}: {directory} has no photographs.")
     if len(missing) == len(runs):
@@ -700,30 +720,33 @@ def _make_no_photographs_error(folder: Path, runs: Sequence[PlannedRun]) -> Inpu
 
 
 def _write_figures(
-    recipe: Recipe,
-    config: RecipeConfig,
-    done: Sequence[DoneRun],
-    recipe_run: RunDirectory,
+    recipe: Recipe, done: Sequence[DoneRun], context: RunContext[RecipeConfig]
 ) -> Iterator[RecipeFigure]:
     """Write the images of all figures of a recipe, and yield their content.
 
+    There are no figures if the run was interrupted.
+
     Args:
         recipe: the recipe.
-        config: settings of the command.
         done: the finished runs with their results.
-        recipe_run: run directory of the recipe, which gets the images.
+        context: context of the recipe's run, whose directory gets the images.
     """
-    rows = _read_frame(recipe, done, recipe_run)
-    number = 0
-    # all options are read before the first figure is made
-    kinds = [
-        read_figure_options(described, config.recipe) for described in recipe.figures
-    ]
-    for kind, options in kinds:
+    if context.ending == results.INTERRUPTED:
+        return
+    rows = _read_frame(recipe, done, context.run)
+    numbers = itertools.count(1)
+    for kind, options in _read_all_figure_options(recipe, context.config.recipe):
         for figure in make_figures(rows, kind, options):
-            number += 1
-            _write_figure(figure, number, recipe_run)
+            _write_figure(figure, next(numbers), context.run)
             yield RecipeFigure.from_values({"figure": kind, **vars(figure)})
+
+
+def _read_all_figure_options(recipe: Recipe, where: str) -> list[tuple[str, Options]]:
+    """Return the kind and the options of each figure of a recipe.
+
+    `where` is the recipe's file or name, for messages.
+    """
+    return [read_figure_options(described, where) for described in recipe.figures]
 
 
 def _write_figure(figure: FigureContent, number: int, recipe_run: RunDirectory) -> None:
@@ -748,10 +771,7 @@ def _read_frame(
     """
     rows = list[dict[str, Any]]()
     units = dict[str, str]()
-    surfaces = dict[str, Any]()
     for run, result in done:
-        if isinstance(run.config, SweepConfig) and result.surface:
-            surfaces[run.name] = result.surface
         run_rows, run_units = _read_run_rows(run, result, recipe_run)
         rows += run_rows
         units |= run_units
@@ -759,10 +779,22 @@ def _read_frame(
         rows,
         recipe.groups,
         units=units,
-        surfaces=surfaces,
+        surfaces=_collect_surfaces(done),
         cores=workbench.count_cores(),
         folder=recipe_run.path,
     )
+
+
+def _collect_surfaces(done: Sequence[DoneRun]) -> dict[str, Any]:
+    """Return what sweeps found about the surface of their object, by name of the run.
+
+    Sweeps without the setting `surface` are left out.
+    """
+    return {
+        run.name: result.surface
+        for run, result in done
+        if isinstance(run.config, SweepConfig) and result.surface
+    }
 
 
 def _list_row_kinds(run: PlannedRun) -> dict[str, Sequence[str]]:
@@ -812,11 +844,11 @@ def read_figure_options(
     Raises:
         InputError: if the kind or an option does not exist, or a value is wrong.
     """
-    kind = str(figure_entry.get("figure", ""))
+    values = dict(figure_entry)
+    kind = str(values.pop("figure", ""))
     if kind not in FIGURES:
         raise errors.UnknownNameError("figure", kind, FIGURES, f"It stands in {where}.")
     options_type, _ = FIGURES[kind]
-    values = {name: value for name, value in figure_entry.items() if name != "figure"}
     try:
         return kind, options_type(**values)
     except ValidationError as error:

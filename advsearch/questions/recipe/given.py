@@ -27,6 +27,8 @@ from advsearch.questions.recipe.rates import (
 MAX_LETTERS = 85
 # minimum number of characters of a shortened name
 MIN_LETTERS = 4
+# height of a stacked bar as a fraction of the distance between bars
+STACKED_BAR_HEIGHT = 0.72
 
 # how often a prediction is given, and how many of these predictions are right
 PredictionCount = tuple[ClusteredFraction, int]
@@ -52,19 +54,28 @@ def make_predictions_figure(rows: Rows, options: PredictionsOptions) -> FigureCo
         value: _count_frequent(group_rows, options.most)
         for value, group_rows in rates.split_rows(rows, options.by).items()
     }
-    table: list[list[rates.Cell]] = [
-        [value, tally.name, *tally.table_cells, n_right]
-        for value, counts in groups.items()
-        for tally, n_right in counts
-    ]
     return FigureContent(
         title=f"Most frequent predictions by {options.by}",
         text=_describe_predictions(groups, rates.pluralize_column(options.by)),
         columns=[options.by, "prediction", "given in", *rates.FRACTION_HEADS, "right"],
-        rows=table,
+        rows=_tabulate_predictions(groups),
         draw=lambda figure: _draw_predictions(figure, groups),
         size=(6.4, 1.2 + 0.3 * len(groups)),
     )
+
+
+def _tabulate_predictions(
+    groups: Mapping[str, Sequence[PredictionCount]],
+) -> list[list[rates.Cell]]:
+    """Return a table row of each group's frequent predictions, with how many are right.
+
+    `groups` has the predictions of each group with their counts.
+    """
+    return [
+        [value, tally.name, *tally.table_cells, n_right]
+        for value, counts in groups.items()
+        for tally, n_right in counts
+    ]
 
 
 def _count_frequent(rows: Rows, most: int) -> list[PredictionCount]:
@@ -113,21 +124,27 @@ def _describe_predictions(
             fraction and how often it is right.
         things: plural of what the groups are.
     """
-    sentences = list[str]()
-    for value, counts in groups.items():
-        tally, n_right = counts[0]
-        if not _is_mostly_right(counts[0]):
-            sentences.append(
-                f"For {value} it is {tally.name}, {tally.describe('given')} and right "
-                "in "
-                f"{n_right} of these."
-            )
+    # the first prediction of each group is the most frequent one
+    sentences = [
+        _describe_mostly_wrong(value, counts[0])
+        for value, counts in groups.items()
+        if not _is_mostly_right(counts[0])
+    ]
     n_mostly_right = len(groups) - len(sentences)
     overview = (
         f"For {n_mostly_right} of {len(groups)} {things} the most frequent prediction "
         "is mostly a right one."
     )
     return [overview, *sentences]
+
+
+def _describe_mostly_wrong(group: str, count: PredictionCount) -> str:
+    """Describe how often a group's most frequent prediction is given, and is right."""
+    tally, n_right = count
+    return (
+        f"For {group} it is {tally.name}, {tally.describe('given')} and right in "
+        f"{n_right} of these."
+    )
 
 
 def _is_mostly_right(count: PredictionCount) -> bool:
@@ -152,14 +169,8 @@ def _draw_stacked_bar(
     for count in counts:
         left += _draw_share(axes, position, left, count)
     other_share = max(1.0 - left, 0.0)  # not below 0 by rounding
-    axes.barh(
-        position,
-        other_share,
-        left=left,
-        color=figures.GREY,
-        alpha=0.15,
-        height=0.72,
-    )
+    style = {"color": figures.GREY, "alpha": 0.15, "height": STACKED_BAR_HEIGHT}
+    axes.barh(position, other_share, left=left, **style)
 
 
 def _draw_share(axes: Any, position: int, left: float, count: PredictionCount) -> float:
@@ -173,23 +184,12 @@ def _draw_share(axes: Any, position: int, left: float, count: PredictionCount) -
     """
     tally, _ = count
     share = tally.fraction or 0.0
-    axes.barh(
-        position,
-        share,
-        left=left,
-        color=figures.BLUE if _is_mostly_right(count) else figures.RED,
-        alpha=0.5,
-        height=0.72,
-        edgecolor="white",
-    )
-    axes.text(
-        left + share / 2,
-        position,
-        shorten_to_fit(tally.name, share),
-        ha="center",
-        va="center",
-        fontsize=7,
-    )
+    color = figures.BLUE if _is_mostly_right(count) else figures.RED
+    style = {"alpha": 0.5, "height": STACKED_BAR_HEIGHT, "edgecolor": "white"}
+    axes.barh(position, share, left=left, color=color, **style)
+    center = left + share / 2
+    name = shorten_to_fit(tally.name, share)
+    axes.text(center, position, name, ha="center", va="center", fontsize=7)
     return share
 
 
@@ -216,6 +216,10 @@ SEED = 0
 RESAMPLES = 2000
 # minimum number of pairs of object and texture: two of each
 MIN_PAIRS = 4
+TOO_FEW_PAIRS = (
+    "Whether the predictions go more by shape or by texture is not said: that takes at "
+    f"least two objects and two textures, {MIN_PAIRS} pairs in all."
+)
 
 
 class CuesOptions(Options):
@@ -238,18 +242,16 @@ def make_cues_figure(rows: Rows, options: CuesOptions) -> FigureContent:
         rows: rows with object and texture.
         options: the columns of both, and the classes that name each texture.
     """
-    # The keys are names of textures.
-    names_texture = dict[str, Any]()  # whether each prediction (n,) names the texture
-    by_shape = dict[str, ClusteredFraction]()  # predictions of the object: right ones
-    by_texture = dict[str, ClusteredFraction]()  # predictions of the texture
-    for texture, texture_rows in rates.split_rows(rows, options.texture).items():
-        predictions = texture_rows[rates.PREDICTION_COLUMN]
-        is_named = _names_class(predictions, options.classes.get(texture, ()))
-        names_texture[texture] = is_named
-        by_shape[texture] = ClusteredFraction.from_rows(texture, texture_rows)
-        by_texture[texture] = ClusteredFraction.from_rows(
-            texture, texture_rows, is_named
+    rows_of_texture = rates.split_rows(rows, options.texture)
+    # for each texture, whether each of its predictions (n,) names it
+    names_texture = {
+        texture: _names_class(
+            texture_rows[rates.PREDICTION_COLUMN], options.classes.get(texture, ())
         )
+        for texture, texture_rows in rows_of_texture.items()
+    }
+    by_shape = _count_named(rows_of_texture)  # a right prediction names the object
+    by_texture = _count_named(rows_of_texture, names_texture)
     return FigureContent(
         title="Predictions by shape and by texture",
         text=_describe_cues(rows, names_texture, by_shape, options),
@@ -258,6 +260,24 @@ def make_cues_figure(rows: Rows, options: CuesOptions) -> FigureContent:
         draw=lambda figure: _draw_cues(figure, by_shape, by_texture),
         size=(6.0, 1.7 + 0.27 * len(by_shape)),
     )
+
+
+def _count_named(
+    rows_of_texture: Mapping[str, Rows], flags: Mapping[str, Any] | None = None
+) -> dict[str, ClusteredFraction]:
+    """Count for each texture how many of its rows are right, or have a flag.
+
+    Args:
+        rows_of_texture: the rows of each texture.
+        flags: for each texture, whether each of its rows (n,) is counted; None counts
+            the right ones.
+    """
+    return {
+        texture: ClusteredFraction.from_rows(
+            texture, texture_rows, None if flags is None else flags[texture]
+        )
+        for texture, texture_rows in rows_of_texture.items()
+    }
 
 
 def _describe_cues(
@@ -370,10 +390,8 @@ def _draw_cues(
     shape_tallies = [by_shape[name] for name in ordered]
     _draw_named(axes, ordered, shape_tallies, [by_texture[name] for name in ordered])
     _draw_intervals(axes, shape_tallies)
-    axes.set(
-        xlabel="share of predictions; line: 95 % interval of the object's",
-        xlim=(0.0, 1.0),
-    )
+    x_label = "share of predictions; line: 95 % interval of the object's"
+    axes.set(xlabel=x_label, xlim=(0.0, 1.0))
     axes.grid(True, axis="x")
     figure.legend(loc="outside lower center", ncols=2, title="the prediction names")
 
@@ -394,16 +412,11 @@ def _draw_named(
     """
     shape_shares = [tally.fraction or 0.0 for tally in shape_tallies]
     texture_shares = [tally.fraction or 0.0 for tally in texture_tallies]
-    style = {"alpha": 0.55, "height": 0.66}
+    style: dict[str, Any] = {"alpha": 0.55, "height": 0.66}
     axes.barh(textures, shape_shares, color=figures.BLUE, label="the object", **style)
-    axes.barh(
-        textures,
-        texture_shares,
-        left=shape_shares,
-        color=figures.RED,
-        label="the texture",
-        **style,
-    )
+    # The bars of the textures begin where those of the objects end.
+    style |= {"left": shape_shares, "color": figures.RED}
+    axes.barh(textures, texture_shares, label="the texture", **style)
 
 
 def _draw_intervals(axes: Any, tallies: Sequence[ClusteredFraction]) -> None:
@@ -499,11 +512,7 @@ def _compare_cues(pairs: Sequence[tuple[int, int, int]]) -> str:
         pairs: counts of each pair of object and texture, from `count_predicted`.
     """
     if len(pairs) < MIN_PAIRS:
-        return (
-            "Whether the predictions go more by shape or by texture is not said: that "
-            "takes at least two objects and "
-            f"two textures, {MIN_PAIRS} pairs in all."
-        )
+        return TOO_FEW_PAIRS
     lower, upper = _bootstrap_shape_advantage(pairs)
     total, n_by_shape, n_by_texture = map(sum, zip(*pairs, strict=True))
     return (
@@ -594,10 +603,10 @@ def make_ternary_figure(rows: Rows, options: TernaryOptions) -> FigureContent:
     corners_of_triangle = list_triangles(options.side)
     in_triangle = _split_by_triangle(options, mixtures, list(corners_of_triangle))
 
-    ranking = rates.rank_predictions(rows[rates.PREDICTION_COLUMN])
+    all_predictions = rates.rank_predictions(rows[rates.PREDICTION_COLUMN])
     margins = _group_margins(rows, names, main_ingredient)
-    by_margin = _shows_margins(ranking, margins)
-    ranking = ranking[: options.most]
+    by_margin = _shows_margins(all_predictions, margins)
+    ranking = all_predictions[: options.most]
     text, heads, table = _describe_mixtures(
         rows, ranking, names, main_ingredient, margins if by_margin else None
     )
@@ -777,17 +786,20 @@ def _describe_margins(
         Sentences, and the heads and rows of a table.
     """
     text = [SINGLE_PREDICTION.format(label), _compare_margins(margins)]
-    heads = [
-        "where most is",
-        "pictures",
-        "mean lead of the right label",
-        "standard error",
-    ]
     table: list[list[rates.Cell]] = [
         [name, len(values), float(values.mean()), _compute_standard_error(values)]
         for name, values in margins.items()
     ]
-    return text, heads, table
+    return text, MARGIN_HEADS, table
+
+
+MARGIN_HEADS = [
+    "where most is",
+    "pictures",
+    "mean lead of the right label",
+    "standard error",
+]
+"""Heads of the table of margins by the main ingredient."""
 
 
 def _describe_ingredients(
@@ -856,10 +868,8 @@ def _compare_ingredients(
     """
     known_fractions = {tally.fraction for tally in tallies if tally.total}
     if len(known_fractions) == 1:
-        return [
-            f"{beginning} given as often whatever most of the mixture is: no "
-            "difference is shown."
-        ]
+        same = "given as often whatever most of the mixture is: no difference is shown"
+        return [f"{beginning} {same}."]
     return rates.describe_extremes(
         tallies,
         lowest_prefix=f"{beginning} rarest where most of the mixture",
@@ -1000,18 +1010,27 @@ def _compare_margins(margins: Mapping[str, Float64Array]) -> str:
     largest = max(margins, key=lambda name: margins[name].mean())
     least = _describe_mean_margin(smallest, margins[smallest])
     most = _describe_mean_margin(largest, margins[largest])
-    widened = f"their intervals, widened for having been chosen among {len(margins)},"
-    verdict = f"No difference is shown: {widened} overlap"
-    n_compared = len(margins)
-    _, upper_of_smallest = _compute_mean_interval(margins[smallest], n_compared)
-    lower_of_largest, _ = _compute_mean_interval(margins[largest], n_compared)
-    if upper_of_smallest < lower_of_largest:
-        verdict = f"The difference is shown: {widened} do not overlap"
+    verdict = _judge_margins(margins[smallest], margins[largest], len(margins))
     # "It" is the right label, which `_describe_margins` names in the sentence before.
     return (
         f"It leads least where most of the mixture is {least}; most where "
         f"most of it is {most}. {verdict}."
     )
+
+
+def _judge_margins(
+    smallest: Float64Array, largest: Float64Array, n_compared: int
+) -> str:
+    """Describe whether the mean margins (n,) of two ingredients differ.
+
+    Their intervals are widened for a choice among `n_compared` ingredients.
+    """
+    widened = f"their intervals, widened for having been chosen among {n_compared},"
+    _, upper_of_smallest = _compute_mean_interval(smallest, n_compared)
+    lower_of_largest, _ = _compute_mean_interval(largest, n_compared)
+    if upper_of_smallest < lower_of_largest:
+        return f"The difference is shown: {widened} do not overlap"
+    return f"No difference is shown: {widened} overlap"
 
 
 def _describe_mean_margin(ingredient: str, margins: Float64Array) -> str:
@@ -1095,6 +1114,15 @@ def _draw_panel(
     return triangles
 
 
+HATCHED_STYLE: Mapping[str, Any] = {
+    "facecolors": "#eeeeef",
+    "edgecolors": "#b9bbc0",
+    "hatch": "////",
+    "linewidth": 0,
+}
+"""How matplotlib draws triangles without a value."""
+
+
 def _draw_triangles(
     axes: Any, values: Sequence[float | None], corners: Sequence[Sequence[Mixture]]
 ) -> Any:
@@ -1109,21 +1137,14 @@ def _draw_triangles(
 
     points = [[_to_plane(mixture) for mixture in mixtures] for mixtures in corners]
     pairs = list(zip(points, values, strict=True))
+    known = [triangle for triangle, value in pairs if value is not None]
+    unknown = [triangle for triangle, value in pairs if value is None]
+    known_values = [value for value in values if value is not None]
     colored = PolyCollection(
-        [triangle for triangle, value in pairs if value is not None],
-        array=[value for value in values if value is not None],
-        cmap="viridis",
-        edgecolors="face",
+        known, array=known_values, cmap="viridis", edgecolors="face"
     )
     axes.add_collection(colored)
-    hatched = PolyCollection(
-        [triangle for triangle, value in pairs if value is None],
-        facecolors="#eeeeef",
-        edgecolors="#b9bbc0",
-        hatch="////",
-        linewidth=0,
-    )
-    axes.add_collection(hatched)
+    axes.add_collection(PolyCollection(unknown, **HATCHED_STYLE))
     return colored
 
 
@@ -1136,17 +1157,22 @@ def _draw_outline(axes: Any, names: Sequence[str]) -> None:
     outline = [_to_plane(mixture) for mixture in pure]
     closed_outline = np.array([*outline, outline[0]])
     axes.plot(*closed_outline.T, color="#1c1d20", linewidth=0.8)
-    for (x, y), name in zip(outline, names, strict=True):
-        is_base = y < 0.1  # a lower corner has y = 0: its name stands below it
-        axes.annotate(
-            name,
-            (x, y),
-            (0, -4 if is_base else 4),
-            textcoords="offset points",
-            ha="center",
-            va="top" if is_base else "bottom",
-            fontsize=8,
-        )
+    for corner, name in zip(outline, names, strict=True):
+        _draw_corner_name(axes, corner, name)
+
+
+def _draw_corner_name(axes: Any, corner: tuple[float, float], name: str) -> None:
+    """Draw the name of an ingredient below a lower corner, or above the upper one."""
+    is_base = corner[1] < 0.1  # a lower corner has y = 0
+    axes.annotate(
+        name,
+        corner,
+        (0, -4 if is_base else 4),
+        textcoords="offset points",
+        ha="center",
+        va="top" if is_base else "bottom",
+        fontsize=8,
+    )
 
 
 def _to_plane(mixture: Mixture) -> tuple[float, float]:
