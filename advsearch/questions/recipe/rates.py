@@ -95,12 +95,10 @@ def read_rows(
     units_of_measure = dict[str, str]()
     with Store.open_to_read(folder) as store:
         sweep_units = _read_sweep_units(store, summary)
-        for row in store.rows():
-            if not _is_counted(row, kinds):
-                continue
-            units_of_measure |= {
-                name: stored["unit"] for name, stored in row.values.items()
-            }
+        counted = (row for row in store.rows() if _is_counted(row, kinds))
+        for row in counted:
+            for name, stored in row.values.items():
+                units_of_measure[name] = stored["unit"]
             values = _read_row_values(row, summary)
             unit = _name_independent_unit(row, folder, seed, summary, sweep_units)
             values |= {"time": row.time, PART_COLUMN: part, "unit": unit}
@@ -374,16 +372,23 @@ def describe_extremes(
     lowest = known[int(np.argmin(shares))]
     highest = known[int(np.argmax(shares))]
     if lowest.fraction == highest.fraction:
-        return [
-            f"All {len(known)} {things} have the same share, "
-            f"{wording.percent(lowest.fraction)}: no difference is shown."
-        ]
+        return [_describe_equal_shares(lowest, len(known), things)]
     lowest_text = _describe_extreme(lowest, shares, verb)
     highest_text = _describe_extreme(highest, shares, verb)
     return [
         f"{lowest_prefix} {lowest_text}; {highest_prefix} {highest_text}.",
         _compare_extremes(lowest, highest, len(known), things),
     ]
+
+
+def _describe_equal_shares(
+    tally: ClusteredFraction, n_fractions: int, things: str
+) -> str:
+    """State that all of several fractions are equal to the one given as `tally`."""
+    return (
+        f"All {n_fractions} {things} have the same share, "
+        f"{wording.percent(tally.fraction)}: no difference is shown."
+    )
 
 
 def _describe_extreme(
@@ -552,24 +557,7 @@ def make_rates_figure(rows: Rows, options: RatesOptions) -> FigureContent:
             "figures: rates: expected rows of a part beside "
             f"{options.beside!r}, got none"
         )
-    series_values = list(split_rows(rows, options.series)) if options.series else [""]
-    cells, bin_centers = _count_cells(rows, series_values, options)
-    totals = _count_series("all", rows, series_values, options)
-    baseline = None
-    if options.beside and len(baseline_rows):
-        # The baseline is the part that all others are compared with.
-        baseline = _count_series("", baseline_rows, series_values, options)
-    series = [options.names.get(value, value) for value in series_values]
-    content = _RatesContent(
-        options=options,
-        series=series,
-        cells=cells,
-        totals=totals,
-        baseline=baseline,
-        bin_centers=bin_centers,
-        rows=rows,
-    )
-    return content.make_figure()
+    return _RatesContent.from_rows(rows, baseline_rows, options).make_figure()
 
 
 @dataclass(frozen=True)
@@ -595,20 +583,40 @@ class _RatesContent:
     bin_centers: Sequence[float] | None
     rows: Rows
 
+    @classmethod
+    def from_rows(
+        cls, rows: Rows, baseline_rows: Rows, options: RatesOptions
+    ) -> _RatesContent:
+        """Count the predictions of some rows for each bar and series.
+
+        Args:
+            rows: the rows without those of the baseline, the part that all others are
+                compared with.
+            baseline_rows: rows of the baseline; may be empty.
+            options: options of the figure.
+        """
+        values = list(split_rows(rows, options.series)) if options.series else [""]
+        cells, bin_centers = _count_cells(rows, values, options)
+        totals = _count_series("all", rows, values, options)
+        baseline = None
+        if options.beside and len(baseline_rows):
+            baseline = _count_series("", baseline_rows, values, options)
+        series = [options.names.get(value, value) for value in values]
+        return cls(options, series, cells, totals, baseline, bin_centers, rows)
+
     def make_figure(self) -> FigureContent:
         """Make the figure: its sentences, its table and how it is drawn."""
         options = self.options
         series_column = [options.series] if options.series else []
-        columns = _name_columns(options)
+        numbers = len(self.bars), len(self.cells), len(self.series)
         return FigureContent(
-            title=f"{'Error' if options.wrong else 'Accuracy'} by {columns}",
+            title=f"{'Error' if options.wrong else 'Accuracy'} by "
+            f"{_name_columns(options)}",
             text=self._describe_rates(),
             columns=[options.by, *series_column, options.verb, *FRACTION_HEADS],
             rows=_tabulate_rates(self.bars, self.totals, self.series, options),
             draw=self.draw,
-            size=_choose_size(
-                len(self.bars), len(self.cells), len(self.series), options
-            ),
+            size=_choose_size(*numbers, options),
         )
 
     @property
@@ -692,9 +700,16 @@ def _count_cells(
         get_column(rows, options.by)
     )
     if options.form == "bars" and are_names:
-        order = sorted(cells, key=lambda name: -(cells[name][0].fraction or 0.0))
-        cells = {name: cells[name] for name in order}
+        cells = _sort_by_first_series(cells)
     return cells, bin_centers
+
+
+def _sort_by_first_series(
+    cells: dict[str, list[ClusteredFraction]],
+) -> dict[str, list[ClusteredFraction]]:
+    """Sort bars by their fraction in the first series, the highest first."""
+    order = sorted(cells, key=lambda name: -(cells[name][0].fraction or 0.0))
+    return {name: cells[name] for name in order}
 
 
 def _count_series(
@@ -751,24 +766,40 @@ def _describe_cells(
     """
     if options.form == "map":
         return _describe_map_cells(cells, series, options)
-    text = list[str]()
     where = f" where {options.axis_label}" if is_binned else ""
-    has_several_series = len(series) > 1
+    if len(series) == 1:
+        return _describe_bars(_select_series(cells, 0), "Lowest", where, options)
+    text = list[str]()
     for index, name in enumerate(series):
         tallies = _select_series(cells, index)
         n_known = sum(tally.total > 0 for tally in tallies)
-        # With a single bar there is nothing to compare within a series.
-        if has_several_series and n_known < 2:
-            continue
-        lowest = f"For {name}, lowest" if has_several_series else "Lowest"
-        text += describe_extremes(
-            tallies,
-            lowest_prefix=f"{lowest}{where}",
-            highest_prefix=f"highest{where}",
-            things=pluralize_column(options.by),
-            verb=options.verb,
-        )
+        if n_known > 1:  # a single bar can be compared with no other of the series
+            text += _describe_bars(tallies, f"For {name}, lowest", where, options)
     return text
+
+
+def _describe_bars(
+    tallies: Sequence[ClusteredFraction],
+    beginning: str,
+    where: str,
+    options: RatesOptions,
+) -> list[str]:
+    """Describe the lowest and the highest bar of a series.
+
+    Args:
+        tallies: the fraction of each bar.
+        beginning: first words of the sentence, such as "Lowest".
+        where: the words that name a binned parameter, such as " where elevation";
+            empty if the bars are no bins.
+        options: options of the figure.
+    """
+    return describe_extremes(
+        tallies,
+        lowest_prefix=f"{beginning}{where}",
+        highest_prefix=f"highest{where}",
+        things=pluralize_column(options.by),
+        verb=options.verb,
+    )
 
 
 def _select_series(cells: Cells, index: int) -> list[ClusteredFraction]:
@@ -823,24 +854,36 @@ def _describe_series(
     if not options.series or len(series) < 2:
         return []
     # The sentence becomes "Over all, the lowest share is that of NAME: ...".
-    names = _name_series(series, options)
     overall = [
         tally.with_name(f"that of {name}")
-        for name, tally in zip(names, totals, strict=True)
+        for name, tally in zip(_name_series(series, options), totals, strict=True)
     ]
-    sentences = describe_extremes(
-        overall,
-        lowest_prefix="Over all, the lowest share",
-        highest_prefix="the highest",
-        things=pluralize_column(options.series),
-        verb=options.verb,
-    )
+    sentences = _describe_overall(overall, options.series, options.verb)
     # Figures of other columns have the same sentences, and `omit_repeated_sentences`
     # drops equal texts. So they are one text here.
     text = [" ".join(sentences)]
     if options.wrong and options.series == MODEL_COLUMN:
         text += _describe_mean_errors(cells, series)
     return text
+
+
+def _describe_overall(
+    overall: Sequence[ClusteredFraction], series_column: str, verb: str
+) -> list[str]:
+    """Describe the series with the lowest and that with the highest fraction of all.
+
+    Args:
+        overall: the fraction of each series over all bars.
+        series_column: name of the column that separates the series.
+        verb: word for what is counted, for example "right" or "wrong".
+    """
+    return describe_extremes(
+        overall,
+        lowest_prefix="Over all, the lowest share",
+        highest_prefix="the highest",
+        things=pluralize_column(series_column),
+        verb=verb,
+    )
 
 
 def _describe_mean_errors(cells: Cells, models: Sequence[str]) -> Iterator[str]:
@@ -1021,6 +1064,17 @@ def _group_rows(
     """
     if options.bins is None and options.form != "lines":
         return split_rows(rows, options.by), None
+    return _split_into_bins(rows, options)
+
+
+def _split_into_bins(
+    rows: Rows, options: RatesOptions
+) -> tuple[dict[str, Rows], list[float]]:
+    """Split rows by bins of equal width of a column, without those outside of its range.
+
+    Returns:
+        The rows by the name of the bin, and the centers of the bins.
+    """
     values = _read_binned_values(rows, options)
     n_bins = options.bins or DEFAULT_BINS
     lower, upper = _find_binned_range(values, options)
@@ -1094,6 +1148,14 @@ def _read_binned_values(rows: Rows, options: RatesOptions) -> Any:
     return np.minimum(arc, options.turn - arc)
 
 
+SLANTED_STYLE: Mapping[str, Any] = {
+    "rotation": 35,
+    "ha": "right",
+    "rotation_mode": "anchor",
+}
+"""How matplotlib draws labels that are too long to stand next to each other."""
+
+
 def _draw_map(axes: Any, cells: Cells, series: Sequence[str], label: str) -> None:
     """Draw the fractions as a matrix of colors with percentages in it.
 
@@ -1109,10 +1171,8 @@ def _draw_map(axes: Any, cells: Cells, series: Sequence[str], label: str) -> Non
     ]
     image = axes.imshow(shares, cmap="RdBu", vmin=0.0, vmax=1.0, aspect="auto")
     _draw_percentages(axes, shares)
-    label_style = dict[str, Any]()
-    if max(map(len, series)) > MAX_UPRIGHT_LETTERS:
-        label_style = {"rotation": 35, "ha": "right", "rotation_mode": "anchor"}
-    axes.set_xticks(range(len(series)), series, **label_style)
+    are_long = max(map(len, series)) > MAX_UPRIGHT_LETTERS
+    axes.set_xticks(range(len(series)), series, **(SLANTED_STYLE if are_long else {}))
     axes.set_yticks(range(len(cells)), list(cells))
     axes.figure.colorbar(
         image,
@@ -1176,18 +1236,15 @@ def _draw_band(
         color: color of the line and of the band.
         **style: label and marker of the line.
     """
-    known = [
-        (position, tally)
-        for position, tally in zip(bin_positions, tallies, strict=True)
-        if tally.total
-    ]
-    positions = [position for position, _ in known]
+    pairs = zip(bin_positions, tallies, strict=True)
+    positions = [position for position, tally in pairs if tally.total]
+    known = [tally for tally in tallies if tally.total]
     # An unknown interval is drawn as a band from 0 to 1.
-    intervals = [tally.interval() or (0.0, 1.0) for _, tally in known]
-    lower = [interval[0] for interval in intervals]
-    upper = [interval[1] for interval in intervals]
+    intervals = [tally.interval() or (0.0, 1.0) for tally in known]
+    lower = [low for low, _ in intervals]
+    upper = [high for _, high in intervals]
     axes.fill_between(positions, lower, upper, color=color, alpha=0.15, linewidth=0)
-    shares = [tally.fraction for _, tally in known]
+    shares = [tally.fraction for tally in known]
     axes.plot(positions, shares, color=color, ms=4, **style)
 
 
@@ -1309,10 +1366,7 @@ class _AgreementContent:
         n_unpaired = len(part_rows) - len(pairs)
         # A photograph may belong to no rendering, but rows of other parts must.
         if part != PHOTOGRAPHS and n_unpaired:
-            raise InputError(
-                f"figures: agreement: expected {part} to have the "
-                f"configurations of {self.options.of[0]}"
-            )
+            raise self._make_unpaired_error(part)
         name = self.options.names.get(part, part)
         self.series.append(name)
         _add_agreement(self.bars, pairs, self.table, name)
@@ -1321,6 +1375,13 @@ class _AgreementContent:
             self.text.append(_describe_agreement(name, total, pairs))
         if part == PHOTOGRAPHS:
             self.text += _describe_photographs(len(pairs), n_unpaired)
+
+    def _make_unpaired_error(self, part: str) -> InputError:
+        """Make the error that a part has other configurations than the renderings."""
+        return InputError(
+            f"figures: agreement: expected {part} to have the "
+            f"configurations of {self.options.of[0]}"
+        )
 
 
 def _select_part(rows: Rows, part: str) -> Rows:
@@ -1489,19 +1550,23 @@ def make_scaling_figure(rows: Rows, options: Options) -> FigureContent:
         int(workers): run_rates.droplevel(WORKERS_COLUMN)
         for workers, run_rates in rate_of_run.groupby(level=WORKERS_COLUMN)
     }
-    table = _tabulate_scaling(rates_by_count)
-    cores = wording.format_count(rows.attrs["cores"], "core")
-    machine = (
-        f"This machine gives {cores}; what other programs took of it meanwhile "
-        "is in these numbers."
-    )
+    machine = _describe_machine(rows.attrs["cores"])
     return FigureContent(
         title="Pictures a second by number of workers",
         text=[*_describe_scaling(rates_by_count), machine],
         columns=SCALING_HEADS,
-        rows=table,
+        rows=_tabulate_scaling(rates_by_count),
         draw=lambda figure: _draw_scaling(figure, rates_by_count, rate_of_run.max()),
         size=(FIGURE_WIDTH, LINES_HEIGHT),
+    )
+
+
+def _describe_machine(n_cores: int) -> str:
+    """Describe the number of cores that the throughputs were measured with."""
+    cores = wording.format_count(n_cores, "core")
+    return (
+        f"This machine gives {cores}; what other programs took of it meanwhile "
+        "is in these numbers."
     )
 
 
@@ -1612,11 +1677,8 @@ def _draw_scaling(
     axes.plot(counts, linear, color="0.7", label=label)
     _draw_throughputs(axes, rates_by_count)
     axes.set_xticks(counts, list(map(str, counts)))
-    axes.set(
-        xlabel="workers",
-        ylabel="pictures a second",
-        ylim=(0.0, 1.08 * max(*linear, max_rate)),
-    )
+    y_end = 1.08 * max(*linear, max_rate)  # 8 % of room above the highest value
+    axes.set(xlabel="workers", ylabel="pictures a second", ylim=(0.0, y_end))
     axes.grid(True, axis="y")
     figure.legend(loc="outside lower center", ncols=2)
 
@@ -1629,22 +1691,14 @@ def _compute_linear_rates(rates_by_count: Mapping[int, Any]) -> list[float]:
 
 def _draw_throughputs(axes: Any, rates_by_count: Mapping[int, Any]) -> None:
     """Draw the median of each worker count as a point, and the range as a bar."""
+    bar_style = {"color": figures.BLUE, "alpha": 0.45, "linewidth": 3}
     for workers, run_rates in rates_by_count.items():
-        axes.plot(
-            [workers] * 2,
-            [run_rates.min(), run_rates.max()],
-            color=figures.BLUE,
-            alpha=0.45,
-            linewidth=3,
-        )
-    axes.plot(
-        list(rates_by_count),
-        [run_rates.median() for run_rates in rates_by_count.values()],
-        "o-",
-        color=figures.BLUE,
-        ms=5,
-        label="median; bar: lowest to highest run",
-    )
+        bounds = [run_rates.min(), run_rates.max()]
+        axes.plot([workers, workers], bounds, **bar_style)
+    medians = [run_rates.median() for run_rates in rates_by_count.values()]
+    label = "median; bar: lowest to highest run"
+    counts = list(rates_by_count)
+    axes.plot(counts, medians, "o-", color=figures.BLUE, ms=5, label=label)
 
 
 def _compute_throughput(times: Any) -> float:
@@ -1711,11 +1765,7 @@ def make_surface_figure(rows: Rows, options: Options) -> FigureContent:
         InputError: if no sweep has `surface: true`.
     """
     surface_of_run = rows.attrs["surfaces"]
-    if not surface_of_run:
-        raise InputError(
-            "figures: surface: expected a sweep with `surface: true` "
-            "among its parts, got none"
-        )
+    _check_surfaces(surface_of_run)
     text = list[str]()
     table = list[list[Cell]]()
     for surface in surface_of_run.values():
@@ -1730,6 +1780,15 @@ def make_surface_figure(rows: Rows, options: Options) -> FigureContent:
         draw=lambda figure: _draw_surfaces(figure, folder, list(surface_of_run)),
         size=(6.4, 2.65 * len(surface_of_run)),
     )
+
+
+def _check_surfaces(surface_of_run: Mapping[str, Any]) -> None:
+    """Raise an error if no sweep has a summary of its object's surface."""
+    if not surface_of_run:
+        raise InputError(
+            "figures: surface: expected a sweep with `surface: true` "
+            "among its parts, got none"
+        )
 
 
 def _draw_surfaces(figure: Any, folder: Path, runs: Sequence[str]) -> None:

@@ -13,7 +13,7 @@ from contextlib import suppress
 from datetime import datetime, timezone
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard, cast
+from typing import Any, NamedTuple, TypeGuard, cast
 
 from advsearch.extend import (
     InputError,
@@ -42,9 +42,6 @@ from advsearch.questions.report.recorded import (
     read_run_settings,
 )
 from advsearch.questions.report.result import ConditionShare, Evidence, EvidenceRun
-
-if TYPE_CHECKING:
-    from advsearch.extend import workbench
 
 
 DRIVES_PART = "ways and speeds"
@@ -1359,8 +1356,6 @@ def _find_twins(
     # The evidence is about a model, and some results are about none.
     if twins is None or not hasattr(result, "model"):
         return stored
-    from advsearch.extend import workbench  # it brings torch, which takes a second
-
     return workbench.find_twin_evidence(
         twins,
         model=str(getattr(result, "model", "")),
@@ -1409,8 +1404,6 @@ def _collect_versions(
     """
     versions = collect_versions(folder, read_paths)
     if getattr(result, "environment", "") == NO_ENVIRONMENT_MAP:
-        from advsearch.extend import workbench  # it brings torch, which takes a second
-
         versions.pop(f"bundled environment {workbench.DEFAULT_ENVIRONMENT}", None)
     return versions
 
@@ -1473,8 +1466,6 @@ def _read_photographs(folder: Path) -> tuple[list[views.Claim], list[Any]]:
     """Return the claims and the rows of a run's photographs."""
     if not (folder / directory.PHOTOGRAPHS).is_dir():
         return [], []
-    from advsearch.extend import workbench  # it brings torch, which takes a second
-
     claims = list_photograph_claims(workbench.load_photographs().agreement(folder))
     with Store.open_to_read(folder) as store:
         rows = list(store.rows("photo")) if claims else []

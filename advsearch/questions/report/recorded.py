@@ -191,8 +191,6 @@ def _list_task_options(recorded_task: Any, objective: object) -> dict[str, Any]:
         recorded_task: the recorded setting `task`.
         objective: the recorded setting `objective`, if it is a name.
     """
-    from advsearch.extend import workbench  # it brings torch, which takes a second
-
     options = dict[str, Any]()
     with suppress(errors.AdvsearchError):
         task = workbench.make_task(recorded_task)
