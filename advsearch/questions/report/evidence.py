@@ -43,7 +43,6 @@ from advsearch.questions.report.recorded import (
 )
 from advsearch.questions.report.result import ConditionShare, Evidence, EvidenceRun
 
-
 DRIVES_PART = "ways and speeds"
 THINGS_PART = "road users and things"
 CAMERA_PART = "camera and picture"
