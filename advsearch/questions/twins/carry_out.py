@@ -83,22 +83,40 @@ def run_twins(context: RunContext[TwinsConfig], *, network: Any = None) -> Twins
     judges, warnings = load_judges(config, network)
     comparison = Comparison(context, judges)
     selection = comparison.select(listing.objects)
-    if listing.n_missing:
-        warnings.append(
-            f"{listing.n_missing} objects are in photographs that are not there; they "
-            "are left out."
-        )
-    warnings += selection.warnings
+    warnings += [*_warn_of_missing(listing.n_missing), *selection.warnings]
     measurements = context.open_measurements()
-
-    def make_result(rows: list[TwinRow]) -> TwinsResult:
-        # Tasks may have new remarks after they were calibrated in the comparison.
-        remarks = [remark for judge in judges for remark in judge.task.output_remarks]
-        return comparison.make_result(rows, [*warnings, *remarks])
-
     # `compare` looks up stored rows, and `collect` gathers stored and new ones.
     rows = comparison.compare(selection, measurements)
+    make_result = partial(_make_result_with_remarks, comparison, judges, warnings)
     return measurements.make_result_of_rows(rows, make_result)
+
+
+def _warn_of_missing(n_missing: int) -> list[str]:
+    """Return a warning if photographs of some objects do not exist."""
+    if not n_missing:
+        return []
+    return [
+        f"{n_missing} objects are in photographs that are not there; they are left out."
+    ]
+
+
+def _make_result_with_remarks(
+    comparison: Comparison,
+    judges: Sequence[ModelJudge],
+    warnings: Sequence[str],
+    rows: list[TwinRow],
+) -> TwinsResult:
+    """Make the result of some rows, with the remarks of the tasks as warnings, too.
+
+    Args:
+        comparison: the comparison, which has made the rows.
+        judges: judges of the models.
+        warnings: warnings of the run.
+        rows: rows of all objects and models.
+    """
+    # Tasks may have new remarks after they were calibrated in the comparison.
+    remarks = [remark for judge in judges for remark in judge.task.output_remarks]
+    return comparison.make_result(rows, [*warnings, *remarks])
 
 
 class ModelJudge:
@@ -293,11 +311,7 @@ class Comparison:
         candidates = {
             number: item for number, item in enumerate(objects) if is_frame(item.frame)
         }
-        visible = {
-            number: item
-            for number, item in candidates.items()
-            if not self._is_hidden(item)
-        }
+        visible = self._select_visible(candidates)
         windows = self._choose_windows(visible)
         if not windows:
             raise InputError(
@@ -308,6 +322,16 @@ class Comparison:
             n_outside=len(visible) - len(windows),
         )
         return Selection(objects, windows, warnings)
+
+    def _select_visible(
+        self, candidates: Mapping[int, PhotographedObject]
+    ) -> dict[int, PhotographedObject]:
+        """Return the objects that are not mostly hidden, by their numbers."""
+        return {
+            number: item
+            for number, item in candidates.items()
+            if not self._is_hidden(item)
+        }
 
     def _choose_windows(
         self, visible: Mapping[int, PhotographedObject]
@@ -426,18 +450,34 @@ class Comparison:
         renderer = self._make_surrounded_renderer(selection, missing)
         for number in numbers:
             layer = layers.pop(number, None)  # None if the rows are stored
-            # The twin is rendered once for all models, and not at all if all rows are
-            # stored.
-            make_twin = cache(
-                partial(self._make_twin, number, selection, layer, renderer)
-            )
-            for index, judge in enumerate(self._judges):
-                yield measurements.get_or_measure_row(
-                    make_row_name(number, index),
-                    TwinRow,
-                    partial(self._compare_object, number, selection, make_twin, judge),
-                )
+            make_twin = partial(self._make_twin, number, selection, layer, renderer)
+            yield from self._compare_models(number, selection, make_twin, measurements)
             self._context.progress.advance(1)
+
+    def _compare_models(
+        self,
+        number: int,
+        selection: Selection,
+        make_twin: Callable[[], rendering.Twin],
+        measurements: Any,
+    ) -> Iterator[TwinRow]:
+        """Yield the rows of one object, for each model.
+
+        Args:
+            number: number of the object.
+            selection: all selected objects.
+            make_twin: function that renders the images of the object.
+            measurements: stored rows of the run.
+        """
+        # The twin is rendered once for all models, and not at all if all rows are
+        # stored.
+        make_shared_twin = cache(make_twin)
+        for index, judge in enumerate(self._judges):
+            measure = partial(
+                self._compare_object, number, selection, make_shared_twin, judge
+            )
+            row_name = make_row_name(number, index)
+            yield measurements.get_or_measure_row(row_name, TwinRow, measure)
 
     def _is_stored(self, number: int, measurements: Any) -> bool:
         """Return whether the rows of an object are stored for all models."""
@@ -463,16 +503,29 @@ class Comparison:
             selection,
             numbers,
         )
-        layers = {}
-        for number in numbers:
-            item = selection.objects[number]
-            window = selection.window_by_row_number[number]
-            photograph = self._load_photograph(item.photograph)
-            layers[number] = renderer.render(
-                item, photograph, window, self._size, number
-            )
-            self.n_renders += 1
-        return layers
+        return {
+            number: self._render_layer(renderer, selection, number)
+            for number in numbers
+        }
+
+    def _render_layer(
+        self, renderer: Any, selection: Selection, number: int
+    ) -> rendering.Layer:
+        """Render the object with some number into its photograph, and count the render.
+
+        Args:
+            renderer: `LayerRenderer` of the object's mesh.
+            selection: all selected objects and their windows.
+            number: number of the object.
+        """
+        item = selection.objects[number]
+        window = selection.window_by_row_number[number]
+        photograph = self._load_photograph(item.photograph)
+        layer: rendering.Layer = renderer.render(
+            item, photograph, window, self._size, number
+        )
+        self.n_renders += 1
+        return layer
 
     def _make_surrounded_renderer(
         self, selection: Selection, numbers: Sequence[int]
@@ -518,11 +571,7 @@ class Comparison:
         )
 
     def _make_twin(
-        self,
-        number: int,
-        selection: Selection,
-        layer: Any,
-        renderer: Any,
+        self, number: int, selection: Selection, layer: Any, renderer: Any
     ) -> rendering.Twin:
         """Render an object in the environment, and return all images of it.
 

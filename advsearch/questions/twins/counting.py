@@ -328,9 +328,7 @@ def _cut_factor(
     edges = np.quantile(values, np.linspace(0.0, 1.0, N_PARTS + 1))
     if len(np.unique(edges)) <= N_PARTS:
         return
-    # The largest value is at the last edge, and belongs to the last part.
-    part_of_row = np.searchsorted(edges, values, side="right") - 1
-    part_of_row = np.clip(part_of_row, 0, N_PARTS - 1)
+    part_of_row = _assign_to_parts(values, edges)
     units = number_units(rows)
     disagrees = _find_disagreements(rows, surroundings)
     for part in range(N_PARTS):
@@ -344,6 +342,17 @@ def _cut_factor(
             disagreeing=int(disagrees[inside].sum()),
             rate=estimate_rate(disagrees[inside], units[inside]),
         )
+
+
+def _assign_to_parts(
+    values: npt.NDArray[np.float64], edges: npt.NDArray[np.float64]
+) -> npt.NDArray[np.intp]:
+    """Return for each value (n,) the index of the part between two edges it lies in.
+
+    The last edge, which is the largest value, belongs to the last part.
+    """
+    part_of_value = np.searchsorted(edges, values, side="right") - 1
+    return np.clip(part_of_value, 0, N_PARTS - 1)
 
 
 def _find_disagreements(rows: Sequence[TwinRow], surroundings: str) -> BoolArray:

@@ -321,12 +321,17 @@ def _read_bop_object(
     mesh = models / f"{name}.ply"
     if not mesh.is_file():
         raise errors.FileFormatError(f"{where}: expected the mesh {mesh}, got none")
+    return {"object": name, "mesh": mesh, "pose": _read_bop_pose(entry, where)}
+
+
+def _read_bop_pose(entry: Mapping[str, Any], where: str) -> Float64Array:
+    """Return the pose (4, 4) of an entry of the ground truth: mesh to camera."""
     rotation = _to_numbers(entry.get("cam_R_m2c"), f"{where}: cam_R_m2c", 9)
     translation = _to_numbers(entry.get("cam_t_m2c"), f"{where}: cam_t_m2c", 3)
     matrix = np.eye(4)
     matrix[:3, :3] = rotation.reshape(3, 3)
     matrix[:3, 3] = translation
-    return {"object": name, "mesh": mesh, "pose": _check_pose(matrix, where)}
+    return _check_pose(matrix, where)
 
 
 def _read_bop_camera(scene: Path, cameras: Mapping[str, Any], image: str) -> Pinhole:
@@ -606,11 +611,7 @@ def _check_pose(matrix: Float64Array, where: str) -> Float64Array:
     camera.
     """
     rotation = matrix[:3, :3]
-    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if error > MAX_ROTATION_ERROR or np.linalg.det(rotation) < 0.0:
-        raise errors.FileFormatError(
-            f"{where}: expected a rotation, got a matrix that stretches or mirrors"
-        )
+    _check_rotation(rotation, where)
     if matrix[2, 3] <= 0.0:
         raise errors.FileFormatError(
             f"{where}: expected an object before the camera (z > 0), got z = "
@@ -620,6 +621,15 @@ def _check_pose(matrix: Float64Array, where: str) -> Float64Array:
     pose: Float64Array = matrix.copy()
     pose[:3, :3] = left @ right
     return np.asarray(pose)
+
+
+def _check_rotation(rotation: Float64Array, where: str) -> None:
+    """Raise an error if a matrix (3, 3) is not close to a rotation."""
+    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if error > MAX_ROTATION_ERROR or np.linalg.det(rotation) < 0.0:
+        raise errors.FileFormatError(
+            f"{where}: expected a rotation, got a matrix that stretches or mirrors"
+        )
 
 
 def _make_pinhole(numbers: Float64Array, where: str) -> Pinhole:

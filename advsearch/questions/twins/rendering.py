@@ -128,17 +128,11 @@ def choose_window(
     """
     low = positions.min(axis=0)
     high = positions.max(axis=0)
-    longer = float((high - low).max())
-    if _is_out_of_view(low, high, photo_size) or longer < MIN_SILHOUETTE:
+    box_size = high - low
+    if _is_out_of_view(low, high, photo_size) or box_size.max() < MIN_SILHOUETTE:
         return None
     photo_height, photo_width = photo_size
-    # From here on, sizes are (width, height), as positions are (x, y).
-    model_width_height = np.array([model_size[1], model_size[0]], np.float64)
-    widened = high - low + 2.0 * margin * longer
-    # the smallest size with the model's aspect ratio that contains the widened box
-    size = model_width_height * float((widened / model_width_height).max())
-    size *= min(1.0, photo_width / size[0], photo_height / size[1])  # not larger
-    width, height = (max(1, math.floor(side)) for side in size)
+    width, height = _compute_window_size(box_size, photo_size, model_size, margin)
     center = (low + high) / 2.0
     return PhotoWindow(
         _center_within(float(center[0]), width, photo_width),
@@ -146,6 +140,33 @@ def choose_window(
         width,
         height,
     )
+
+
+def _compute_window_size(
+    box_size: Float64Array,
+    photo_size: tuple[int, int],
+    model_size: tuple[int, int],
+    margin: float,
+) -> tuple[int, int]:
+    """Return width and height of the window around a bounding box, in pixels.
+
+    Args:
+        box_size: (width, height) of the box.
+        photo_size: (height, width) of the photograph.
+        model_size: (height, width) of the images that the model takes.
+        margin: width that is added on each side, as a fraction of the box's longer
+            side.
+    """
+    photo_height, photo_width = photo_size
+    model_height, model_width = model_size
+    # All sizes from here on are (width, height), as that of the box is.
+    model_shape = np.array([model_width, model_height], np.float64)
+    widened = box_size + 2.0 * margin * float(box_size.max())
+    # the smallest size with the model's aspect ratio that contains the widened box
+    size = model_shape * float((widened / model_shape).max())
+    size *= min(1.0, photo_width / size[0], photo_height / size[1])  # not larger
+    width, height = (max(1, math.floor(side)) for side in size)
+    return width, height
 
 
 def _is_out_of_view(
@@ -258,12 +279,8 @@ class LayerRenderer:
         scene_inputs = renderer.scene.input_assembler(
             make_camera_inputs(item, self._asset, window)
         )
-        seed = seeds.derive_seed(self._seed, "layer", number)
         with torch.no_grad():
-            # with an alpha channel, since the environment is hidden
-            rendered = renderer.render_radiance(
-                scene_inputs, seed, self._spp, hide_environment=True
-            )
+            rendered = self._render_without_environment(scene_inputs, number)
             surfaces = renderer.scene.find_surfaces(scene_inputs)
             rendered = resize(rendered, (window.height, window.width))
             image_inputs = self._make_image_inputs(item, photograph, window)
@@ -272,6 +289,19 @@ class LayerRenderer:
         sight = _make_sight(surfaces, self._asset.size_in_metres, model_size)
         alpha = rendered[..., 3].clamp(0.0, 1.0)
         return Layer(composed=composed, alpha=alpha, visible_surface=sight)
+
+    def _render_without_environment(self, scene_inputs: Any, number: int) -> Tensor:
+        """Render the radiance of the object alone, with an alpha channel: (h, w, 4).
+
+        Args:
+            scene_inputs: inputs of the scene, with those of the camera.
+            number: number of the row, from which the seed of the noise is derived.
+        """
+        seed = seeds.derive_seed(self._seed, "layer", number)
+        radiance: Tensor = self._renderer.render_radiance(
+            scene_inputs, seed, self._spp, hide_environment=True
+        )
+        return radiance
 
     def _make_image_inputs(
         self,
