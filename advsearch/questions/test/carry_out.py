@@ -89,10 +89,7 @@ def try_suite(
     start = time.perf_counter()
     config = context.config
     context.progress.stage("reading the suite")
-    # A run of `twins` compares renders with photographs. If it cannot be read, the
-    # error is raised before the work begins.
-    if config.twins is not None:
-        workbench.read_twins(config.twins)
+    _check_twins(config)
     # A resumed run has stored the suite with which it has started, and tests that, even
     # if the file has changed since.
     noted_suite = _read_noted_suite(context.resumed_directory)
@@ -111,6 +108,15 @@ def try_suite(
         # With `add`, the only result is that of the new counterexample.
         _check_added(added, suite_run.results[0], config)
     return suite_run.make_result(context.ending, added)
+
+
+def _check_twins(config: SuiteConfig) -> None:
+    """Raise an error if the run of `twins` that the settings name cannot be read.
+
+    Such a run compares renders with photographs. The error comes before the work begins.
+    """
+    if config.twins is not None:
+        workbench.read_twins(config.twins)
 
 
 def _check_added(

@@ -363,10 +363,9 @@ class ClaimTester:
             sample = self._sample_pictures(evaluated, claim, sequence)
 
         example, picture = self._report_worst(name, problem, sample.worst)
+        task = problem.task.name
+        reason = _describe_sample(claim, sample, sequence.interval, example, task)
         is_late = sample.verdict == UNDECIDED and self.out_of_time
-        reason = _describe_sample(
-            claim, sample, sequence.interval, example, problem.task.name
-        )
         if is_late:
             reason += f"; {OUT_OF_TIME_REASON}"
         update = {
@@ -591,10 +590,7 @@ class ClaimTester:
             example: the counterexample.
             config: settings with which it is tested.
         """
-        statement = (
-            f"{config.model} is right on a scene that was predicted as "
-            f"{example.wrong_label}"
-        )
+        statement = _state_counterexample(config.model, example)
         untested_result = untested_result.model_copy(update={"statement": statement})
         try:
             parts = workbench.load_parts(config)
@@ -829,6 +825,11 @@ def _make_evaluators(
         return evaluator, None
     # Changed images are predicted in this process, without workers.
     return evaluator, workbench.ParallelEvaluator(other_problem)
+
+
+def _state_counterexample(model: str, example: Counterexample) -> str:
+    """State what is claimed about a model by a counterexample."""
+    return f"{model} is right on a scene that was predicted as {example.wrong_label}"
 
 
 def _explain_change(
@@ -1071,15 +1072,22 @@ def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
     n_to_fail = count_needed(1.0 - threshold)
     needed = max(n_to_hold, n_to_fail)
     if claim.pictures < needed:
-        raise InputError(
-            f"claims.{name}.pictures: expected at least {needed}, since with fewer one "
-            "of the verdicts held and failed is impossible at a confidence of "
-            f"{wording.format_number(confidence)}, got {claim.pictures}"
-        )
+        raise _make_too_few_pictures_error(name, claim.pictures, needed, confidence)
     if not isinstance(claim, NoWorseClaim):
         return ""
     # Models that predict alike have a score of 1/2 on each picture.
     return _remark_on_equal_models(name, claim, count_needed(threshold, value=0.5))
+
+
+def _make_too_few_pictures_error(
+    name: str, n_pictures: int, needed: int, confidence: float
+) -> InputError:
+    """Make the error that a claim has fewer pictures than are needed for a verdict."""
+    return InputError(
+        f"claims.{name}.pictures: expected at least {needed}, since with fewer one "
+        "of the verdicts held and failed is impossible at a confidence of "
+        f"{wording.format_number(confidence)}, got {n_pictures}"
+    )
 
 
 def _remark_on_equal_models(
@@ -1259,10 +1267,38 @@ def _trials_result(
     interval = None
     if total:
         interval = statistics.intervals.clopper_pearson(n_right, total)
+    return {
+        "verdict": verdict,
+        "reason": _explain_trials(
+            sample, verdict, interval, task, has_conditions=has_conditions
+        ),
+        "pictures": len(sample.outcomes),
+        "rate": n_right / total if total else None,
+        "interval": interval,
+    }
+
+
+def _explain_trials(
+    sample: _TrialSample,
+    verdict: str,
+    interval: tuple[float, float] | None,
+    task: str,
+    *,
+    has_conditions: bool,
+) -> str:
+    """Describe why trials of a counterexample have a verdict.
+
+    Args:
+        sample: the trials.
+        verdict: HELD, FAILED or UNDECIDED.
+        interval: interval of the fraction of right trials; None if no trial counts.
+        task: name of the task.
+        has_conditions: whether conditions vary.
+    """
     outcome_counts = workbench.count_outcomes(sample.wrong_payloads)
-    reason = words.describe_trials(
+    return words.describe_trials(
         verdict,
-        n_right=n_right,
+        n_right=sample.n_right,
         n_wrong=sample.n_wrong,
         n_uncounted=sample.n_uncounted,
         label=sample.label,
@@ -1270,13 +1306,6 @@ def _trials_result(
         has_conditions=has_conditions,
         outcomes=wording.format_outcomes(outcome_counts, task),
     )
-    return {
-        "verdict": verdict,
-        "reason": reason,
-        "pictures": len(sample.outcomes),
-        "rate": n_right / total if total else None,
-        "interval": interval,
-    }
 
 
 def _same_picture(_query: workbench.Query, picture: Tensor) -> Tensor:

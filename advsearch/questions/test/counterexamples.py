@@ -515,13 +515,7 @@ def _fails_on_example(
     configurations = [u, start] if has_conditions else [u]
     outcomes = list[bool | None]()
     for index in range(trials):
-        # a stream of seeds that only these trials use
-        seed = seeds.derive_seed(problem.seed, "kept", index)
-        judgements = [
-            _judge_render(problem, configuration, seed, example.spp)
-            for configuration in configurations
-        ]
-        is_right = is_right_in_trial(*judgements)
+        is_right = _try_configurations(problem, configurations, index, example.spp)
         outcomes.append(is_right)
         # After one right trial, the verdict of a single scene cannot be FAILED.
         if is_right and not has_conditions:
@@ -529,6 +523,26 @@ def _fails_on_example(
     n_right = outcomes.count(True)
     n_wrong = outcomes.count(False)
     return decide_trials(n_right, n_wrong, has_conditions=has_conditions) == FAILED
+
+
+def _try_configurations(
+    problem: Problem, configurations: Sequence[Tensor], index: int, spp: int
+) -> bool | None:
+    """Return whether the model is right in a trial; None if the trial does not count.
+
+    Args:
+        problem: problem of the run.
+        configurations: (d,) the counterexample; and the clean scene if conditions vary.
+        index: index of the trial.
+        spp: samples per pixel.
+    """
+    # a stream of seeds that only these trials use
+    seed = seeds.derive_seed(problem.seed, "kept", index)
+    judgements = [
+        _judge_render(problem, configuration, seed, spp)
+        for configuration in configurations
+    ]
+    return is_right_in_trial(*judgements)
 
 
 def _judge_render(
@@ -645,12 +659,8 @@ def _write_smallest(
     """
     block_sizes = [block.size for block in problem.domain.blocks]
     blocks = np.split(offsets, np.cumsum(block_sizes)[:-1])
-    *coarse_forms, finest_form = FORMS
-    # All forms store a block of up to `MAX_FINE_VALUES` in the same way.
-    has_large_block = max(block_sizes) > MAX_FINE_VALUES
-    if not has_large_block:
-        coarse_forms = []
     trials = _count_confirming_trials(has_conditions=has_conditions)
+    *coarse_forms, finest_form = _list_forms(max(block_sizes))
     for stores_signs, square in coarse_forms:
         # This replaces the file of the form before.
         example = _write_form(base, values, blocks, stores_signs, square)
@@ -658,6 +668,17 @@ def _write_smallest(
             return example
     stores_signs, square = finest_form
     return _write_form(base, values, blocks, stores_signs, square)
+
+
+def _list_forms(max_block_size: int) -> Sequence[tuple[bool, int]]:
+    """Return the forms of a counterexample that differ, from the coarsest to the finest.
+
+    A form is whether only signs are stored, and the side of the squares of texels that
+    share a value.
+    """
+    # All forms store a block of up to `MAX_FINE_VALUES` in the same way.
+    has_large_block = max_block_size > MAX_FINE_VALUES
+    return FORMS if has_large_block else FORMS[-1:]
 
 
 def _count_confirming_trials(*, has_conditions: bool) -> int:

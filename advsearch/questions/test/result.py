@@ -175,15 +175,7 @@ def make_view(result: SuiteResult) -> ShownResult:
     First comes a table of all claims, then a section for each claim that is not held,
     with its picture and the command that repeats it.
     """
-    sections = [
-        ResultPart(
-            "The claims",
-            column_heads=TABLE_HEADS,
-            rows=make_table_rows(result),
-            note=READING_NOTE,
-            parts=[claim.part for claim in result.claims],
-        )
-    ]
+    sections = [_make_claims_part(result)]
     for claim in result.claims:
         # There is no section for a claim that is held, nor for one that was not tested.
         was_not_tested = claim.cause is Cause.COUNTEREXAMPLE_FAILED
@@ -193,6 +185,17 @@ def make_view(result: SuiteResult) -> ShownResult:
     subject = [Path(result.suite).name, result.object, result.model]
     summary = f"{result.title}. {describe_suite(result)}"
     return ShownResult(summary, sections, list_facts(result), subject)
+
+
+def _make_claims_part(result: SuiteResult) -> ResultPart:
+    """Make the table of all claims."""
+    return ResultPart(
+        "The claims",
+        column_heads=TABLE_HEADS,
+        rows=make_table_rows(result),
+        note=READING_NOTE,
+        parts=[claim.part for claim in result.claims],
+    )
 
 
 def _make_claim_section(claim: ClaimResult) -> ResultPart:
@@ -313,7 +316,7 @@ def describe_difference(
     if not n_pictures:
         return "no picture"
     pictures = wording.format_count(n_pictures, "picture")
-    # percentage points
+    # percentage points, as the difference is
     bounds = " to ".join(f"{100.0 * bound:+.1f}" for bound in interval)
     points = 100.0 * (n_only_this - n_only_other) / n_pictures
     reason = (
@@ -702,17 +705,21 @@ def format_sarif(result: SuiteResult) -> str:
     ]
     rules = [_make_sarif_rule(kind) for kind in kinds]
     driver = {"name": "advsearch", "version": __version__, "rules": rules}
-    invocation = {
-        "executionSuccessful": not result.is_unfinished,
-        "commandLine": result.command_line or "",
-    }
     run = {
         "tool": {"driver": driver},
-        "invocations": [invocation],
+        "invocations": [_make_sarif_invocation(result)],
         "results": sarif_results,
     }
     log = {"$schema": SARIF_SCHEMA, "version": "2.1.0", "runs": [run]}
     return json.dumps(log, indent=2, ensure_ascii=False) + "\n"
+
+
+def _make_sarif_invocation(result: SuiteResult) -> dict[str, object]:
+    """Return what SARIF states about the run: its command, and whether it has ended."""
+    return {
+        "executionSuccessful": not result.is_unfinished,
+        "commandLine": result.command_line or "",
+    }
 
 
 def _read_suite_lines(result: SuiteResult) -> list[str]:
@@ -793,14 +800,15 @@ def format_markdown(result: SuiteResult) -> str:
         "",
         ", ".join(fact_texts),
     ]
-    commands = [
-        claim.repeat
-        for claim in result.claims
-        if claim.verdict != HELD and claim.repeat
-    ]
+    commands = _list_repeating_commands(result.claims)
     if commands:
         lines += ["", "```sh", *commands, "```"]
     return "\n".join(lines) + "\n"
+
+
+def _list_repeating_commands(claims: Sequence[ClaimResult]) -> list[str]:
+    """Return the commands that repeat the claims that are not held."""
+    return [claim.repeat for claim in claims if claim.verdict != HELD and claim.repeat]
 
 
 def _format_claim_table(result: SuiteResult) -> list[str]:
