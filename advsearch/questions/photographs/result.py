@@ -242,11 +242,6 @@ def make_align_page(
         key: key that the server expects with a photograph.
         phone_address: address by which another device opens the page; None if none can.
     """
-    header = markup.make_element(
-        "header",
-        markup.make_element("p", "Photographs", class_="eyebrow"),
-        markup.make_element("h1", f"{run}, photographed"),
-    )
     data = []
     scripts: tuple[str, ...] = ()
     if renderings:
@@ -257,11 +252,20 @@ def make_align_page(
     # `connects` lets the script send the photograph to the server.
     return markup.make_document(
         f"{run}, photographs",
-        header,
+        _make_align_header(run),
         _make_main(renderings, table, phone_address),
         data=data,
         scripts=scripts,
         connects=True,
+    )
+
+
+def _make_align_header(run: str) -> markup.Html:
+    """Make the header of the page on which photographs of a run are taken."""
+    return markup.make_element(
+        "header",
+        markup.make_element("p", "Photographs", class_="eyebrow"),
+        markup.make_element("h1", f"{run}, photographed"),
     )
 
 
@@ -341,12 +345,6 @@ def make_agreement_table(table: PhotoAgreement) -> markup.Html:
     """
     if not table.photos or table.interval is None:
         return markup.make_element("p", "No photographs yet.", class_="soft")
-    heads = ("photographs", "right in the photograph", "wrong in the photograph")
-    counts = [
-        ["right in the rendering", str(table.right_right), str(table.right_wrong)],
-        ["wrong in the rendering", str(table.wrong_right), str(table.wrong_wrong)],
-    ]
-    count_table = markup.make_table(heads, counts)
     by_rendering = markup.make_element(
         "div",
         _rendering_table(table.renderings),
@@ -356,10 +354,20 @@ def make_agreement_table(table: PhotoAgreement) -> markup.Html:
         aria_label="by rendering",
     )
     return markup.join_html(
-        markup.make_element("div", count_table, class_="agreement"),
+        markup.make_element("div", _make_outcome_table(table), class_="agreement"),
         markup.make_element("p", _describe_photo_agreement(table)),
         by_rendering,
     )
+
+
+def _make_outcome_table(table: PhotoAgreement) -> markup.Html:
+    """Make the table of how many photographs and renderings are right and wrong."""
+    heads = ("photographs", "right in the photograph", "wrong in the photograph")
+    counts = [
+        ["right in the rendering", str(table.right_right), str(table.right_wrong)],
+        ["wrong in the rendering", str(table.wrong_right), str(table.wrong_wrong)],
+    ]
+    return markup.make_table(heads, counts)
 
 
 def _describe_photo_agreement(table: PhotoAgreement) -> str:

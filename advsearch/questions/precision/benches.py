@@ -448,19 +448,23 @@ class PictureBench:
         parts, spp = self._render_reference_parts(line, budget, seed, on_done)
         rows = []
         if denoiser == "none":
-            image = estimate_reference(
-                parts, lambda mean: flatten(self._display_mean(mean))
-            )
+            image = estimate_reference(parts, self._display_flat_mean)
             self._references["picture", "none"] = image
             rows.append(_make_row("picture", line, image, spp))
         # Denoised images are compared with the reference without denoiser, too.
         self._references["picture", denoiser] = self._references["picture", "none"]
-        margin = estimate_reference(
-            parts, lambda mean: np.array([self._margin(self._display_mean(mean))])
-        )
+        margin = estimate_reference(parts, self._compute_margin_of_mean)
         self._references["margin", denoiser] = margin
         rows.append(_make_row("margin", line, margin, spp))
         return rows
+
+    def _display_flat_mean(self, mean: Float64Array) -> Float64Array:
+        """Return the displayed image of a mean radiance as a vector (n,)."""
+        return flatten(self._display_mean(mean))
+
+    def _compute_margin_of_mean(self, mean: Float64Array) -> Float64Array:
+        """Return the model's margin on the displayed image of a mean radiance, (1,)."""
+        return np.array([self._margin(self._display_mean(mean))])
 
     def _render_reference_parts(
         self,

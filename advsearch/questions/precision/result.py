@@ -334,26 +334,34 @@ def _make_parts(result: PrecisionResult) -> list[ResultPart]:
         _make_error_table(quantity, result.points)
         for quantity in ("picture", "margin", "gradient")
     ]
-    slope_table = ResultPart.make_table(
-        result.slopes,
-        SLOPE_COLUMNS,
-        title="Slopes: logarithm of the error against that of samples",
-    )
-    reference_table = ResultPart.make_table(
-        result.references,
-        REFERENCE_COLUMNS,
-        title="References, with their own errors",
-        note=READING_NOTE,
-    )
     return [
         ResultPart("Recommended", recommendations),
         # On a page this note is at the table of references instead.
         ResultPart(text=[READING_NOTE], only_medium="text"),
         *error_tables,
-        slope_table,
-        reference_table,
+        _make_slope_table(result),
+        _make_reference_table(result),
         ResultPart("Not measured for lack of time", result.left_out),
     ]
+
+
+def _make_slope_table(result: PrecisionResult) -> ResultPart:
+    """Make the table of how fast the error of each estimator falls with its samples."""
+    return ResultPart.make_table(
+        result.slopes,
+        SLOPE_COLUMNS,
+        title="Slopes: logarithm of the error against that of samples",
+    )
+
+
+def _make_reference_table(result: PrecisionResult) -> ResultPart:
+    """Make the table of the references that errors are measured against."""
+    return ResultPart.make_table(
+        result.references,
+        REFERENCE_COLUMNS,
+        title="References, with their own errors",
+        note=READING_NOTE,
+    )
 
 
 def make_headline(result: PrecisionResult) -> str:
@@ -591,17 +599,18 @@ def _draw_errors(
         result: result with these points, and with the slopes and the goal.
     """
     _draw_estimators(axes, points, result.slopes)
-    axes.set(
-        xscale="log",
-        yscale="log",
-        xlabel="seconds of processor time",
-        ylabel="relative error, %",
-    )
+    axes.set(xscale="log", yscale="log")
+    axes.set(xlabel="seconds of processor time", ylabel="relative error, %")
     _draw_theory(axes, points)
     _plain_axis(axes.xaxis)
     _plain_axis(axes.yaxis)
     _draw_goal(axes, result.goal * PERCENT)
     axes.grid(True, which="major")
+    _add_slope_legend(axes)
+
+
+def _add_slope_legend(axes: Any) -> None:
+    """Add the legend of the estimators, with their slopes, to the right of the axes."""
     axes.legend(
         loc="upper left",
         bbox_to_anchor=(1.0, 1.0),

@@ -239,9 +239,7 @@ def summarize_samples(
     is_heavy = is_heavy_tailed(samples)
     interval = None
     if is_known and not is_heavy and len(squares) > 1:
-        # The error has about the same relative deviation as the root mean square.
-        factor = _interval_factor(squares, mean_square)
-        interval = (error / factor, error * factor)
+        interval = _estimate_error_interval(error, squares)
     fields: dict[str, object] = {
         "repeats": len(samples),
         "status": "ok" if is_known else "reference unusable",
@@ -278,6 +276,17 @@ def _average_cosine(samples: Sequence[Numbers]) -> float | None:
 
 # upper limit of the logarithm of an interval's factor, so that exp does not overflow
 MAX_LOG_FACTOR = 50.0
+
+
+def _estimate_error_interval(
+    error: float, squares: Sequence[float]
+) -> tuple[float, float]:
+    """Return the interval of an error, from the squares of the measured errors.
+
+    The error has about the same relative deviation as the root of their mean.
+    """
+    factor = _interval_factor(squares, statistics.fmean(squares))
+    return error / factor, error * factor
 
 
 def _interval_factor(squares: Sequence[float], mean_square: float) -> float:
@@ -361,9 +370,7 @@ def fit_line(
     log_counts = np.log([float(point.spp) for point in known])
     line = linregress(log_counts, np.log([point.rms_error for point in known]))
     slope = float(line.slope)
-    # Student's t distribution; `len(known)` - 2, as the fit has two parameters
-    quantile = float(stdtrit(len(known) - 2, (1.0 + CONFIDENCE) / 2.0))
-    half_width = quantile * float(line.stderr)
+    half_width = _find_t_quantile(len(known)) * float(line.stderr)
     return PrecisionSlope(
         quantity=known[0].quantity,
         control=known[0].control,
@@ -376,6 +383,15 @@ def fit_line(
         or_steeper=bool(or_steeper),
         agrees=_agrees_with_theory(slope, half_width, or_steeper),
     )
+
+
+def _find_t_quantile(n_points: int) -> float:
+    """Return half the width of a slope's interval in units of its standard error.
+
+    It is a quantile of Student's t distribution. A line has two parameters, so that
+    `n_points` points leave `n_points` - 2 degrees of freedom.
+    """
+    return float(stdtrit(n_points - 2, (1.0 + CONFIDENCE) / 2.0))
 
 
 def _agrees_with_theory(
@@ -665,11 +681,26 @@ def _interpolate_count(
         return _extrapolate_count(ordered, goal, line, or_steeper), "extrapolated"
     above = ordered[last_above]
     below = ordered[last_above + 1]
+    return _interpolate_count_between(above, below, goal), "interpolated"
+
+
+def _interpolate_count_between(
+    above: PrecisionPoint, below: PrecisionPoint, goal: float
+) -> float:
+    """Return the number of samples at which the error between two points is the goal.
+
+    Samples and error are interpolated on logarithmic axes.
+
+    Args:
+        above: point whose error is above the goal.
+        below: point with more samples, whose error is at most the goal.
+        goal: the relative error.
+    """
     # position of the goal between `above` (0) and `below` (1), on a logarithmic scale
     fraction = math.log(above.rms_error / goal) / math.log(
         above.rms_error / below.rms_error
     )
-    return above.spp * (below.spp / above.spp) ** fraction, "interpolated"
+    return above.spp * (below.spp / above.spp) ** fraction
 
 
 def _extrapolate_count(

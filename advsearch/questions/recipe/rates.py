@@ -557,7 +557,7 @@ def make_rates_figure(rows: Rows, options: RatesOptions) -> FigureContent:
             "figures: rates: expected rows of a part beside "
             f"{options.beside!r}, got none"
         )
-    return _RatesContent.from_rows(rows, baseline_rows, options).make_figure()
+    return _RatesContent.from_predictions(rows, baseline_rows, options).make_figure()
 
 
 @dataclass(frozen=True)
@@ -584,7 +584,7 @@ class _RatesContent:
     rows: Rows
 
     @classmethod
-    def from_rows(
+    def from_predictions(
         cls, rows: Rows, baseline_rows: Rows, options: RatesOptions
     ) -> _RatesContent:
         """Count the predictions of some rows for each bar and series.

@@ -440,16 +440,25 @@ def describe_box(
     sides = []
     for index, name in enumerate(varied.names):
         side = _make_described_side(name, *described)
-        if side is None:
-            side = BoxSide(
-                name=name,
-                unit="of the range",
-                low=float(grown.low[index]),
-                high=float(grown.high[index]),
-                centre=float(grown.center[index]),
-            )
-        sides.append(side)
+        sides.append(side or _make_side_of_range(name, grown, index))
     return sides
+
+
+def _make_side_of_range(name: str, grown: boxes.GrownBox, index: int) -> BoxSide:
+    """Make a side of a box whose parameter no control describes.
+
+    Args:
+        name: name of the parameter.
+        grown: the box.
+        index: index of the side.
+    """
+    return BoxSide(
+        name=name,
+        unit="of the range",
+        low=float(grown.low[index]),
+        high=float(grown.high[index]),
+        centre=float(grown.center[index]),
+    )
 
 
 def _make_described_side(

@@ -261,16 +261,25 @@ def count_transfer(
         return None
     n_clean_right = sum(row.ending != CLEAN_IS_WRONG for row in rows)
     n_holding = sum(row.ending == HOLDS for row in rows)
-    rate = None
-    if n_clean_right:
-        interval = statistics.intervals.clopper_pearson(n_holding, n_clean_right)
-        rate = results.Estimate(value=n_holding / n_clean_right, interval=interval)
     return PhotographTransfer(
         photographs=len(rows),
         clean_right=n_clean_right,
         holding=n_holding,
-        rate=rate,
+        rate=_estimate_holding_rate(n_holding, n_clean_right),
     )
+
+
+def _estimate_holding_rate(
+    n_holding: int, n_clean_right: int
+) -> results.Estimate | None:
+    """Estimate the fraction of photographs in which a scene holds.
+
+    It is among those in which the model is right for the clean scene; None without any.
+    """
+    if not n_clean_right:
+        return None
+    interval = statistics.intervals.clopper_pearson(n_holding, n_clean_right)
+    return results.Estimate(value=n_holding / n_clean_right, interval=interval)
 
 
 def describe_transfer(transfer: PhotographTransfer, kind: str = "other") -> str:

@@ -391,6 +391,12 @@ def _is_weight(value: Any) -> bool:
     return is_number and bool(0.0 <= value <= 1e9)
 
 
+DEPENDENT_PREDICTIONS = (
+    "Weighted by {axis}: not computed, as predictions are not independent (frames of a "
+    "drive are not)."
+)
+
+
 def describe_exposure(
     result: results.Result, conditions: Sequence[ConditionShare], exposure: Exposure
 ) -> list[str]:
@@ -423,10 +429,7 @@ def describe_exposure(
         if is_independent:
             lines.append(_describe_weighted(axis, rows, weights))
         else:
-            lines.append(
-                f"Weighted by {axis}: not computed, as predictions are not independent "
-                "(frames of a drive are not)."
-            )
+            lines.append(DEPENDENT_PREDICTIONS.format(axis=axis))
     return lines
 
 
@@ -488,12 +491,12 @@ def _compute_weighted_mean(
     for value, weight in weights.items():
         row = rows[value]
         fraction = weight / total
-        interval = statistics.intervals.clopper_pearson(
+        lower_bound, upper_bound = statistics.intervals.clopper_pearson(
             row.right, row.total, confidence
         )
         mean = mean + fraction * row.right / row.total
-        lower = lower + fraction * interval[0]
-        upper = upper + fraction * interval[1]
+        lower = lower + fraction * lower_bound
+        upper = upper + fraction * upper_bound
     return mean, lower, upper
 
 
@@ -710,17 +713,12 @@ def list_photograph_claims(photos: Any) -> list[views.Claim]:
     extent = results.Extent.from_count(
         "photographs that agree", agreeing, photos.photos, photos.interval
     )
-    text = (
+    statement = (
         "Photographs and renderings agree (both right, or both wrong) in "
-        f"{wording.format_extent(extent)}."
+        f"{wording.format_extent(extent)}. "
+        "The interval takes photographs as independent."
     )
-    return [
-        views.Claim(
-            kind="measured",
-            statement=f"{text} The interval takes photographs as independent.",
-            extent=extent,
-        )
-    ]
+    return [views.Claim(kind="measured", statement=statement, extent=extent)]
 
 
 def warn_of_different_models(
@@ -1185,14 +1183,15 @@ def collect_evidence(
     """
     evidence_runs = list[EvidenceRun]()
     pictures = dict[str, bytes]()
+    weights = exposure or {}
     for number, folder in enumerate(_list_folders(runs), 1):
         run_pictures = _read_pictures(folder, number)
         pictures |= run_pictures
-        run = _make_evidence_run(folder, criterion, exposure or {}, twins)
+        run = _make_evidence_run(folder, criterion, weights, twins)
         update = {"pictures": list(run_pictures), "started": _format_start(folder)}
         evidence_runs.append(run.model_copy(update=update))
     warnings = _compare_models(evidence_runs)
-    warnings += _warn_of_unknown_axes(exposure or {}, evidence_runs)
+    warnings += _warn_of_unknown_axes(weights, evidence_runs)
     evidence = Evidence(
         runs=evidence_runs,
         warnings=warnings,

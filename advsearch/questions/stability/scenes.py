@@ -360,15 +360,7 @@ def texels_at_the_ends() -> CaseOutcome:
     """
     controls = {"texture": {"resolution": 8, "epsilon": 0.2}}
     renderer = make_renderer(controls, make_checkered_mug)
-    # the derivatives from the gradient and from finite differences
-    slope, expected_slope = measure_inward_slope(
-        renderer,
-        _compute_mean_gradient(renderer),
-        factor=1.0,
-        seeds=8,
-        spp=REFERENCE_SPP,
-    )
-    error = abs(slope / expected_slope - 1.0)
+    error = _measure_inward_error(renderer)
     error_check = check_range(
         "gradient error along a direction that points inwards",
         error,
@@ -379,6 +371,21 @@ def texels_at_the_ends() -> CaseOutcome:
     checks = [error_check, *_check_texels(renderer.start, best)]
     scene = check_scene(controls, make_checkered_mug, compare=False)
     return scene.with_checks(*checks, relative_error=error)
+
+
+def _measure_inward_error(renderer: gradients.Renderer) -> float:
+    """Return the relative error of the gradient along a direction that points inwards.
+
+    The reference is the derivative by finite differences.
+    """
+    slope, expected_slope = measure_inward_slope(
+        renderer,
+        _compute_mean_gradient(renderer),
+        factor=1.0,
+        seeds=8,
+        spp=REFERENCE_SPP,
+    )
+    return abs(slope / expected_slope - 1.0)
 
 
 def _check_texels(start: Tensor, best: Tensor) -> list[Check]:

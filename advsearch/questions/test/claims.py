@@ -363,9 +363,9 @@ class ClaimTester:
             sample = self._sample_pictures(evaluated, claim, sequence)
 
         example, picture = self._report_worst(name, problem, sample.worst)
+        is_late = sample.verdict == UNDECIDED and self.out_of_time
         task = problem.task.name
         reason = _describe_sample(claim, sample, sequence.interval, example, task)
-        is_late = sample.verdict == UNDECIDED and self.out_of_time
         if is_late:
             reason += f"; {OUT_OF_TIME_REASON}"
         update = {

@@ -616,11 +616,6 @@ def _make_values(
     """
     verified = summary.verified
     assert verified is not None
-    stored_settings = {
-        name: value
-        for name, value in config.to_json().items()
-        if name not in NOT_DECIDING
-    }
     # Settings whose files must not change. Those of the network are not among them,
     # since the suite may replace the network.
     settings_with_files = make_paths_relative(select_deciding_settings(config))
@@ -629,10 +624,19 @@ def _make_values(
         "run": path.name,
         # the most frequent wrong prediction
         "said": next(iter(verified.labels), ""),
-        "settings": make_paths_relative(stored_settings),
+        "settings": make_paths_relative(_select_stored_settings(config)),
         "files": directory.summary.compute_file_digests(settings_with_files),
         "scene": compute_scene_digest(parts.scene.description),
         "spp": verified.spp,
+    }
+
+
+def _select_stored_settings(config: AttackConfig) -> dict[str, Any]:
+    """Return the settings that a counterexample stores, by name."""
+    return {
+        name: value
+        for name, value in config.to_json().items()
+        if name not in NOT_DECIDING
     }
 
 

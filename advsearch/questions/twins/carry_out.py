@@ -451,10 +451,12 @@ class Comparison:
         for number in numbers:
             layer = layers.pop(number, None)  # None if the rows are stored
             make_twin = partial(self._make_twin, number, selection, layer, renderer)
-            yield from self._compare_models(number, selection, make_twin, measurements)
+            yield from self._compare_object_by_model(
+                number, selection, make_twin, measurements
+            )
             self._context.progress.advance(1)
 
-    def _compare_models(
+    def _compare_object_by_model(
         self,
         number: int,
         selection: Selection,
