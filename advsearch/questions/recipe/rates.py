@@ -608,6 +608,7 @@ class _RatesContent:
         """Make the figure: its sentences, its table and how it is drawn."""
         options = self.options
         series_column = [options.series] if options.series else []
+        # numbers of groups of bars, of rows of a map, and of series
         numbers = len(self.bars), len(self.cells), len(self.series)
         return FigureContent(
             title=f"{'Error' if options.wrong else 'Accuracy'} by "
