@@ -674,8 +674,9 @@ def _range_around(
         half_width = min(half_width, FULL_TURN / 2)
         lower, upper = -math.inf, math.inf  # not clipped
     bounds = [max(center - half_width, lower), min(center + half_width, upper)]
-    from_scale = math.exp if parameter.log else float
-    return [from_scale(bound) for bound in bounds]
+    if parameter.log:
+        return [math.exp(bound) for bound in bounds]
+    return bounds
 
 
 def _add_photographs(
