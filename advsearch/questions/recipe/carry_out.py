@@ -637,8 +637,8 @@ def sample_around(
         distribution.mean.items(), distribution.deviation, strict=True
     ):
         control, _, parameter_name = name.partition(".")
-        search_range = (search_ranges[name].low, search_ranges[name].high)
         parameter = _find_parameter(control, parameter_name)
+        search_range = (search_ranges[name].low, search_ranges[name].high)
         sampled_range = _range_around(mean.value, deviation, search_range, parameter)
         controls.setdefault(control, {})[parameter_name] = sampled_range
     return config.model_copy(update={"controls": controls, "sampler": "random"})

@@ -99,8 +99,8 @@ def read_rows(
         for row in counted:
             for name, stored in row.values.items():
                 units_of_measure[name] = stored["unit"]
-            values = _read_row_values(row, summary)
             unit = _name_independent_unit(row, folder, seed, summary, sweep_units)
+            values = _read_row_values(row, summary)
             values |= {"time": row.time, PART_COLUMN: part, "unit": unit}
             rows.append({**values, **more})
     return rows, units_of_measure

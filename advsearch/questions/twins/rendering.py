@@ -129,7 +129,8 @@ def choose_window(
     low = positions.min(axis=0)
     high = positions.max(axis=0)
     box_size = high - low
-    if _is_out_of_view(low, high, photo_size) or box_size.max() < MIN_SILHOUETTE:
+    longer_side = float(box_size.max())
+    if _is_out_of_view(low, high, photo_size) or longer_side < MIN_SILHOUETTE:
         return None
     photo_height, photo_width = photo_size
     width, height = _compute_window_size(box_size, photo_size, model_size, margin)
