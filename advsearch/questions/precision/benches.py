@@ -91,13 +91,13 @@ class MeasuredRounds:
         """
         if setting in self.wall_seconds:
             return self._median_of_last_calls(setting)
-        seconds_per_cost = self._estimate_line_speeds()
+        seconds_per_cost = self._estimate_seconds_per_cost()
         slowest_line = max(seconds_per_cost.values(), default=0.0)
         return setting.relative_cost * seconds_per_cost.get(
             setting.estimator_key, slowest_line
         )
 
-    def _estimate_line_speeds(self) -> dict[Any, float]:
+    def _estimate_seconds_per_cost(self) -> dict[Any, float]:
         """Estimate the seconds per unit of cost on each line that has been called."""
         most_expensive_of_line: dict[Any, SampleSetting] = {}
         # Later settings replace earlier ones, so that the most expensive one is left.

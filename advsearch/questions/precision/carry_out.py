@@ -334,7 +334,7 @@ class QuantityMeasurer:
         points: Sequence[PrecisionPoint],
         confirmations: Sequence[PrecisionPoint],
     ) -> list[Recommended]:
-        """Return the fastest setting that reaches the goal; see `recommend_settings`.
+        """Return the fastest settings that reach the goal; see `recommend_settings`.
 
         Args:
             points: measured settings.

@@ -500,7 +500,7 @@ def _make_ground(
 
 
 def _make_square(half_size: np.float32) -> assets.Mesh:
-    """Return a horizontal square around the origin, with half the length of its side."""
+    """Return a horizontal square around the origin, by half the length of its side."""
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
     normals = np.tile(np.array([[0, 0, 1]], np.float32), (4, 1))
