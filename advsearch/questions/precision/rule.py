@@ -700,7 +700,8 @@ def _interpolate_count_between(
     fraction = math.log(above.rms_error / goal) / math.log(
         above.rms_error / below.rms_error
     )
-    return above.spp * (below.spp / above.spp) ** fraction
+    count: float = above.spp * (below.spp / above.spp) ** fraction
+    return count
 
 
 def _extrapolate_count(
