@@ -23,19 +23,24 @@ def make_view(result: RenderResult) -> ShownResult:
     has_several_views = len(result.views) > 1
     if has_several_views:
         return ShownResult(headline, [_make_table_of_views(result)])
+    return ShownResult(headline, _make_parts_of_view(result))
+
+
+def _make_parts_of_view(result: RenderResult) -> list[ResultPart]:
+    """Return what the model predicts in the only view, and the things that are in it."""
     view = result.views[0]
     predictions = [
         format_image_prediction_cells(result.task, answer) for answer in view.answers
     ]
-    sections = [ResultPart(f"Model {result.model} sees", rows=predictions)]
+    parts = [ResultPart(f"Model {result.model} sees", rows=predictions)]
     if view.things is not None:
         things = format_thing_rows(
             {name: vars(thing) for name, thing in view.things.items()}
         )
         # The first column has the names of the things, and no head.
         heads = ("", *VISIBLE_HEADS)
-        sections.append(ResultPart("In the picture", column_heads=heads, rows=things))
-    return ShownResult(headline, sections)
+        parts.append(ResultPart("In the picture", column_heads=heads, rows=things))
+    return parts
 
 
 def _make_table_of_views(result: RenderResult) -> ResultPart:

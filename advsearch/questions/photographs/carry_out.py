@@ -85,12 +85,7 @@ def photo_agreement(run: str | Path) -> PhotoAgreement:
         photos=n_photos,
         agreement=agreement,
         interval=interval,
-        renderings=[
-            _summarize_rendering(str(name), str(model), photos)
-            for (name, model), photos in table.groupby(
-                ["rendering", "model"], sort=False
-            )
-        ],
+        renderings=_summarize_renderings(table),
         **_count_outcomes(table),
     )
 
@@ -102,30 +97,34 @@ def _read_photos(run: Path) -> pd.DataFrame:
     "correct" and "predicted", which are about the photograph; and "agrees", whether
     both predictions are right or both are wrong.
     """
-    rows = list[dict[str, object]]()
     with workbench.hold_process_lock(), Store.open_to_read(run) as store:
-        for row in store.rows(PHOTO):
-            photo = _stored_photo(row)
-            has_all_fields = photo.keys() >= set(STORED_FIELDS)
-            if not has_all_fields:
-                raise errors.FileFormatError(
-                    f"row {row.id}: expected what was kept of a photograph, got "
-                    "something else"
-                )
-            model = str(row.values["model"]["value"]) if "model" in row.values else ""
-            rows.append(
-                {
-                    **photo,
-                    "right": bool(photo["right"]),
-                    "model": model,
-                    "correct": bool(row.correct),
-                    "predicted": row.label or "",
-                }
-            )
+        rows = [_make_photo_row(row) for row in store.rows(PHOTO)]
     columns = [*STORED_FIELDS, "model", "correct", "predicted"]
     table = pd.DataFrame(rows, columns=columns)
     table["agrees"] = table["right"] == table["correct"]
     return table
+
+
+def _make_photo_row(row: workbench.Row) -> dict[str, object]:
+    """Return the columns of a stored prediction about an aligned photograph.
+
+    Raises:
+        FileFormatError: the row lacks what is stored of a photograph.
+    """
+    photo = _stored_photo(row)
+    has_all_fields = photo.keys() >= set(STORED_FIELDS)
+    if not has_all_fields:
+        raise errors.FileFormatError(
+            f"row {row.id}: expected what was kept of a photograph, got something else"
+        )
+    model = str(row.values["model"]["value"]) if "model" in row.values else ""
+    return {
+        **photo,
+        "right": bool(photo["right"]),
+        "model": model,
+        "correct": bool(row.correct),
+        "predicted": row.label or "",
+    }
 
 
 def _stored_photo(row: workbench.Row) -> dict[str, Any]:
@@ -153,6 +152,15 @@ def _count_outcomes(table: pd.DataFrame) -> dict[str, int]:
         for rendering, is_rendering_right in outcomes.items()
         for photograph, is_photograph_right in outcomes.items()
     }
+
+
+def _summarize_renderings(table: pd.DataFrame) -> list[PhotographedRendering]:
+    """Summarize the photographs of each rendering and model."""
+    groups = table.groupby(["rendering", "model"], sort=False)
+    return [
+        _summarize_rendering(str(name), str(model), photos)
+        for (name, model), photos in groups
+    ]
 
 
 def _summarize_rendering(
@@ -197,16 +205,20 @@ def find_photographs(path: Path, task: workbench.AnyTask) -> list[Path]:
         file for file in files if file.suffix.lower() in SUFFIXES and file.is_file()
     ]
     unaligned = [file for file in photographs if not ALIGNED_NAME.fullmatch(file.stem)]
-    if not unaligned:
-        return photographs
+    if unaligned:
+        _check_unaligned(unaligned[0], task)
+    return photographs
+
+
+def _check_unaligned(file: Path, task: workbench.AnyTask) -> None:
+    """Raise an error if a task needs the rendering of a photograph that names none."""
     loaded_task = workbench.make_task(task)
     if loaded_task and _needs_position(loaded_task):
         raise InputError(
-            f"{unaligned[0].name}: the task asks where the object is, and only a "
+            f"{file.name}: the task asks where the object is, and only a "
             "rendering says that; name the file rendering-NUMBER.jpg by the "
             "rendering that it was aligned with, or take it out"
         )
-    return photographs
 
 
 def _needs_position(task: Task) -> bool:
@@ -259,22 +271,20 @@ class Photographs:
         aligned with the rendering 12. All other files show the object in any position.
         They are evaluated, but not compared with a rendering.
         """
-        with Store.open_to_read(run) as store:
-            stored_names = {
-                _stored_photo(row).get("source")
-                for kind in (PHOTO, LOOSE_PHOTO)
-                for row in store.rows(kind)
-            }
+        stored_names = _list_sources(run)
         for file in files:
-            if file.name in stored_names:
-                continue
-            aligned = ALIGNED_NAME.fullmatch(file.stem)
-            rendering = aligned[1] if aligned else None
-            data = stored_files.read_bytes(file, "a photograph", markup.MAX_BODY_BYTES)
-            try:
-                self._add_in_thread(run, rendering, data, source=file.name)
-            except InputError as error:
-                raise InputError(f"{file.name}: {error}") from None
+            if file.name not in stored_names:
+                self._add_file(run, file)
+
+    def _add_file(self, run: Path, file: Path) -> None:
+        """Evaluate and store the photograph of a file; an error names the file."""
+        aligned = ALIGNED_NAME.fullmatch(file.stem)
+        rendering = aligned[1] if aligned else None
+        data = stored_files.read_bytes(file, "a photograph", markup.MAX_BODY_BYTES)
+        try:
+            self._add_in_thread(run, rendering, data, source=file.name)
+        except InputError as error:
+            raise InputError(f"{file.name}: {error}") from None
 
     def agreement(self, run: Path) -> PhotoAgreement:
         """Return the table of agreement of a run."""
@@ -311,21 +321,10 @@ class Photographs:
         """
         with RunDirectory.resume(run) as resumed_run:
             number = resumed_run.store.get_last_step(LOOSE_PHOTO) + 1
-            rows = []
-            for evaluator in self._load_evaluators(run):
-                # `size` is (height, width), and the function takes (width, height).
-                cut_photo = result.sanitize_photo(data, evaluator.size[::-1])
-                row = workbench.Row(LOOSE_PHOTO, number, values={})
-                stored_photo: dict[str, JsonValue] = {"source": source}
-                rows.append(
-                    _add_prediction(
-                        row,
-                        evaluator,
-                        rendering=None,
-                        cut_photo=cut_photo,
-                        stored_photo=stored_photo,
-                    )
-                )
+            rows = [
+                _make_loose_row(evaluator, number, data, source)
+                for evaluator in self._load_evaluators(run)
+            ]
             resumed_run.append_rows(*rows)
 
     def _add_aligned(self, run: Path, rendering: str, data: bytes, source: str) -> None:
@@ -346,34 +345,102 @@ class Photographs:
             cut_photo = result.sanitize_photo(data, image.size)
         # The number of a photograph is one more than that of the one before.
         with RunDirectory.resume(run) as resumed_run:
-            number = resumed_run.store.get_last_step(PHOTO) + 1
-            file_name = f"{rendering}-{number:04d}.jpg"
-            rows = []
-            for evaluator in self._load_evaluators(run):
-                rendering_right, rendering_label, row_values = (
-                    evaluator.evaluate_rendering(
-                        resumed_run.store, rendering, rendering_file
-                    )
-                )
-                stored_photo: dict[str, JsonValue] = {
-                    "source": source,
-                    "rendering": rendering,
-                    "right": rendering_right,
-                    "label": rendering_label,
-                    "file": file_name,
-                }
-                row = workbench.Row(PHOTO, number, values=row_values)
-                rows.append(
-                    _add_prediction(
-                        row,
-                        evaluator,
-                        rendering=rendering,
-                        cut_photo=cut_photo,
-                        stored_photo=stored_photo,
-                    )
-                )
-            writing.write_bytes(run / directory.PHOTOGRAPHS / file_name, cut_photo)
+            photo = _AlignedPhoto(
+                number=resumed_run.store.get_last_step(PHOTO) + 1,
+                rendering=rendering,
+                rendering_file=rendering_file,
+                source=source,
+                cut_photo=cut_photo,
+            )
+            rows = [
+                photo.make_row(evaluator, resumed_run.store)
+                for evaluator in self._load_evaluators(run)
+            ]
+            writing.write_bytes(
+                run / directory.PHOTOGRAPHS / photo.file_name, cut_photo
+            )
             resumed_run.append_rows(*rows)
+
+
+def _list_sources(run: Path) -> set[object]:
+    """Return the names of the files that the photographs of a run came from."""
+    with Store.open_to_read(run) as store:
+        return {
+            _stored_photo(row).get("source")
+            for kind in (PHOTO, LOOSE_PHOTO)
+            for row in store.rows(kind)
+        }
+
+
+def _make_loose_row(
+    evaluator: _PhotoEvaluator, number: int, data: bytes, source: str
+) -> workbench.Row:
+    """Make the row of a model's prediction about a photograph without a rendering.
+
+    Args:
+        evaluator: evaluator of the model.
+        number: number of the photograph.
+        data: the image file.
+        source: name of the file that it came from.
+    """
+    # `size` is (height, width), and the function takes (width, height).
+    cut_photo = result.sanitize_photo(data, evaluator.size[::-1])
+    return _add_prediction(
+        workbench.Row(LOOSE_PHOTO, number, values={}),
+        evaluator,
+        rendering=None,
+        cut_photo=cut_photo,
+        stored_photo={"source": source},
+    )
+
+
+@dataclass(frozen=True)
+class _AlignedPhoto:
+    """A photograph that was aligned with a rendering.
+
+    Attributes:
+        number: number of the photograph in its run.
+        rendering: name of the rendering.
+        rendering_file: image of the rendering.
+        source: name of the file that the photograph came from.
+        cut_photo: the photograph, cropped to the rendering, an image file as bytes.
+    """
+
+    number: int
+    rendering: str
+    rendering_file: Path
+    source: str
+    cut_photo: bytes
+
+    @property
+    def file_name(self) -> str:
+        """Name of the file that it is stored in."""
+        return f"{self.rendering}-{self.number:04d}.jpg"
+
+    def make_row(self, evaluator: _PhotoEvaluator, store: Store) -> workbench.Row:
+        """Make the row of a model's predictions about photograph and rendering.
+
+        Args:
+            evaluator: evaluator of the model.
+            store: stored rows of the run.
+        """
+        is_right, label, values = evaluator.evaluate_rendering(
+            store, self.rendering, self.rendering_file
+        )
+        stored_photo: dict[str, JsonValue] = {
+            "source": self.source,
+            "rendering": self.rendering,
+            "right": is_right,
+            "label": label,
+            "file": self.file_name,
+        }
+        return _add_prediction(
+            workbench.Row(PHOTO, self.number, values=values),
+            evaluator,
+            rendering=self.rendering,
+            cut_photo=self.cut_photo,
+            stored_photo=stored_photo,
+        )
 
 
 def _add_prediction(
@@ -545,10 +612,7 @@ def _find_sweep_truth(
     job = sweep.job
     task = job.tasks[model_index]
     if image_number is None or not _needs_position(task):
-        scene = next(
-            (scene for scene in job.scenes if scene.object_name == object_name),
-            job.scenes[0],
-        )
+        scene = _find_scene_of_object(job, object_name)
         # The ground truth needs no values of the configuration.
         return task.truth(job.make_ground_truth_facts(scene, {}))
     number = int(image_number)
@@ -560,6 +624,12 @@ def _find_sweep_truth(
     scene, queries = sweep.make_queries(number)  # a query for each model
     query = queries[model_index]
     return scene.problems[model_index].find_truth(query.u, query.values)
+
+
+def _find_scene_of_object(job: Any, object_name: str | None) -> Any:
+    """Return the scene of an object; the first scene if none has this object."""
+    matching = (scene for scene in job.scenes if scene.object_name == object_name)
+    return next(matching, job.scenes[0])
 
 
 def _load_attack_evaluators(run: Path, config: AttackConfig) -> list[_PhotoEvaluator]:
@@ -605,16 +675,24 @@ def _find_attack_truth(
     # If the truth does not depend on the configuration, the clean scene's is the same.
     if is_adversarial and _needs_position(task):
         u = workbench.read_stored_configuration(run, problem)
-    # A trial has the conditions that its seed draws. Other renderings have those of the
-    # scene, for which the seed is None. Their names do not have "verification-": then
-    # `rpartition` returns the full name, which is no number.
-    _, _, trial_number = (rendering or "").rpartition("verification-")
-    seed = None
-    if trial_number.isdecimal():
-        seed = seeds.derive_seed(problem.seed, "verification", int(trial_number))
+    seed = _find_trial_seed(problem.seed, rendering or "")
     configuration = problem.make_full_configuration(u, seed)
     facts = problem.make_facts(
         lambda: problem.space.describe(configuration),
         lambda: problem.renderer.find_surfaces(configuration),
     )
     return task.truth(facts)
+
+
+def _find_trial_seed(problem_seed: int, rendering: str) -> int | None:
+    """Return the seed of the conditions that a rendering has.
+
+    A trial has the conditions that its seed draws. Other renderings have those of the
+    scene, for which the seed is None.
+    """
+    # Other names do not have "verification-": then `rpartition` returns the full name,
+    # which is no number.
+    _, _, trial_number = rendering.rpartition("verification-")
+    if trial_number.isdecimal():
+        return seeds.derive_seed(problem_seed, "verification", int(trial_number))
+    return None

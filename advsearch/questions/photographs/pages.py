@@ -114,21 +114,30 @@ class PhotographPages:
             RequestRejected: another page sent it, there is no such rendering, or the
                 data is no photograph.
         """
-        sent_key = headers.get(KEY, "").encode("utf-8", "replace")
-        # `compare_digest` takes equally long for all keys, so that its time reveals
-        # nothing about the key.
-        has_key = hmac.compare_digest(key.encode(), sent_key)
-        if headers.get("Origin") is None or not has_key:
-            raise markup.RequestRejected(
-                HTTPStatus.FORBIDDEN,
-                "a photograph is sent by the page that this server shows; open it anew",
-            )
+        _check_sender(headers, key)
         with reject_invalid(HTTPStatus.NOT_FOUND):
             find_rendering(run, name)
         with reject_invalid(HTTPStatus.BAD_REQUEST):
             table = self._photographs.add(run, name, read_data())
         response = {"table": str(make_agreement_table(table))}
         return "application/json", json.dumps(response).encode()
+
+
+def _check_sender(headers: Message, key: str) -> None:
+    """Raise an error unless a request comes from this server's own page.
+
+    Raises:
+        RequestRejected: the request lacks the key, or the header "Origin".
+    """
+    sent_key = headers.get(KEY, "").encode("utf-8", "replace")
+    # `compare_digest` takes equally long for all keys, so that its time reveals
+    # nothing about the key.
+    has_key = hmac.compare_digest(key.encode(), sent_key)
+    if headers.get("Origin") is None or not has_key:
+        raise markup.RequestRejected(
+            HTTPStatus.FORBIDDEN,
+            "a photograph is sent by the page that this server shows; open it anew",
+        )
 
 
 @contextmanager

@@ -91,6 +91,14 @@ N_NAMED_RENDERINGS = 8
 """Number of renderings that the page names, in addition to the last one."""
 JPEG_QUALITY = 95
 """Quality of stored photographs, 1 to 95."""
+NO_RENDERINGS = (
+    "This run kept no pictures to align with. An attack keeps them when it "
+    "ends; a sweep with "
+)
+INSTRUCTIONS = (
+    "Lay a rendering over what the camera sees, move the real object until both "
+    "agree, and take a photograph."
+)
 _NAME = re.compile(r"[0-9]{1,12}|clean|adversarial|verification-[0-9]{2}")
 _PHOTO = re.compile(rf"(?:{_NAME.pattern})-[0-9]{{4,9}}\.jpg")
 
@@ -103,19 +111,26 @@ def find_rendering(run: Path, name: str) -> Path:
     Raises:
         InputError: the run has none of that name.
     """
-    file = None
-    if _NAME.fullmatch(name):
-        is_of_sweep = name.isdecimal()
-        if is_of_sweep:
-            file = markup.find_thumbnail(run, int(name))
-        else:
-            file = run / directory.IMAGES / f"{name}.png"
+    file = _locate_rendering(run, name)
     if file is None or not file.is_file():
         raise InputError(
             f"rendering: {run.name} has none called {name[:40]!r}; open "
             "its page for those that it has"
         )
     return file
+
+
+def _locate_rendering(run: Path, name: str) -> Path | None:
+    """Return the path that the image of a rendering has if it exists.
+
+    None if no rendering has a name of this pattern, or a sweep stored none of them.
+    """
+    if not _NAME.fullmatch(name):
+        return None
+    is_of_sweep = name.isdecimal()
+    if is_of_sweep:
+        return markup.find_thumbnail(run, int(name))
+    return run / directory.IMAGES / f"{name}.png"
 
 
 def list_renderings(run: Path) -> tuple[str, ...]:
@@ -181,16 +196,7 @@ def _decode_photo(data: bytes) -> Image.Image:
     """
     try:
         with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "WEBP")) as image:
-            # `open` reads the size without decoding the pixels.
-            if image.width * image.height > MAX_PIXELS:
-                raise InputError(
-                    f"photo: expected at most {MAX_PIXELS:,} pixels, got "
-                    f"{image.width} x {image.height}"
-                )
-            # A JPEG is decoded at about the size that is needed.
-            image.draft("RGB", (2 * MAX_SIZE, 2 * MAX_SIZE))
-            # Phones store the direction in EXIF, and not by rotated pixels.
-            return ImageOps.exif_transpose(image).convert("RGB")
+            return _decode_upright(image)
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):
         raise InputError(
             f"photo: expected at most {MAX_PIXELS:,} pixels, got far more"
@@ -200,6 +206,20 @@ def _decode_photo(data: bytes) -> Image.Image:
             "photo: expected a picture in JPEG, PNG or WebP, got "
             "something else or a part"
         ) from None
+
+
+def _decode_upright(image: Image.Image) -> Image.Image:
+    """Decode an opened image, upright and in RGB, unless it has too many pixels."""
+    # `open` reads the size without decoding the pixels.
+    if image.width * image.height > MAX_PIXELS:
+        raise InputError(
+            f"photo: expected at most {MAX_PIXELS:,} pixels, got "
+            f"{image.width} x {image.height}"
+        )
+    # A JPEG is decoded at about the size that is needed.
+    image.draft("RGB", (2 * MAX_SIZE, 2 * MAX_SIZE))
+    # Phones store the direction in EXIF, and not by rotated pixels.
+    return ImageOps.exif_transpose(image).convert("RGB")
 
 
 # ---- the page
@@ -222,18 +242,6 @@ def make_align_page(
         key: key that the server expects with a photograph.
         phone_address: address by which another device opens the page; None if none can.
     """
-    main = markup.make_element(
-        "main",
-        _align_section(renderings),
-        markup.make_element("h2", "Renderings and reality"),
-        markup.make_element("div", make_agreement_table(table), id="agreement"),
-        None if phone_address is None else _phone_section(phone_address),
-    )
-    header = markup.make_element(
-        "header",
-        markup.make_element("p", "Photographs", class_="eyebrow"),
-        markup.make_element("h1", f"{run}, photographed"),
-    )
     data = []
     scripts: tuple[str, ...] = ()
     if renderings:
@@ -243,7 +251,34 @@ def make_align_page(
         scripts = ("make.js", "align.js")
     # `connects` lets the script send the photograph to the server.
     return markup.make_document(
-        f"{run}, photographs", header, main, data=data, scripts=scripts, connects=True
+        f"{run}, photographs",
+        _make_align_header(run),
+        _make_main(renderings, table, phone_address),
+        data=data,
+        scripts=scripts,
+        connects=True,
+    )
+
+
+def _make_align_header(run: str) -> markup.Html:
+    """Make the header of the page on which photographs of a run are taken."""
+    return markup.make_element(
+        "header",
+        markup.make_element("p", "Photographs", class_="eyebrow"),
+        markup.make_element("h1", f"{run}, photographed"),
+    )
+
+
+def _make_main(
+    renderings: Sequence[str], table: PhotoAgreement, phone_address: str | None
+) -> markup.Html:
+    """Return the content of the page: the camera, the agreement, and the address."""
+    return markup.make_element(
+        "main",
+        _align_section(renderings),
+        markup.make_element("h2", "Renderings and reality"),
+        markup.make_element("div", make_agreement_table(table), id="agreement"),
+        None if phone_address is None else _phone_section(phone_address),
     )
 
 
@@ -254,53 +289,51 @@ def _align_section(renderings: Sequence[str]) -> markup.Html:
     element "align".
     """
     if not renderings:
-        reason = (
-            "This run kept no pictures to align with. An attack keeps them when it "
-            "ends; a sweep with "
-        )
         return markup.make_element(
-            "p", reason, markup.make_element("code", "keep_pictures=all"), "."
+            "p", NO_RENDERINGS, markup.make_element("code", "keep_pictures=all"), "."
         )
-    # The page names the first renderings, and the last one.
-    names = ", ".join(renderings[:N_NAMED_RENDERINGS])
-    if len(renderings) > N_NAMED_RENDERINGS:
-        names += f", ... {renderings[-1]}"
-    instructions = (
-        "Lay a rendering over what the camera sees, move the real object until both "
-        "agree, and take a photograph."
-    )
-    names_element = markup.make_element(
-        "p",
-        f"Renderings of this run ({len(renderings)}): {names}.",
-        class_="soft",
-        id="renderings",
-    )
     no_script = markup.make_element(
         "p", "The camera needs JavaScript, which is switched off."
     )
     content = markup.join_html(
-        markup.make_element("p", instructions),
-        names_element,
+        markup.make_element("p", INSTRUCTIONS),
+        _make_names_element(renderings),
         markup.make_element("noscript", no_script),
     )
     return markup.make_element("div", content, id="align")
 
 
+def _make_names_element(renderings: Sequence[str]) -> markup.Html:
+    """Return a paragraph with the names of the first renderings and of the last one."""
+    names = ", ".join(renderings[:N_NAMED_RENDERINGS])
+    if len(renderings) > N_NAMED_RENDERINGS:
+        names += f", ... {renderings[-1]}"
+    return markup.make_element(
+        "p",
+        f"Renderings of this run ({len(renderings)}): {names}.",
+        class_="soft",
+        id="renderings",
+    )
+
+
 def _phone_section(address: str) -> markup.Html:
     """Return an address and its QR code, by which a phone opens the page."""
-    code = markup.make_qr_code(address)
-    if code:
-        title = "QR code of the address below"
-        content = markup.Html(code.svg_inline(omitsize=True, light="#fff", title=title))
-    else:
-        content = markup.make_element(
-            "p", f"A code to point the phone at would stand here: {markup.NO_QR}"
-        )
     return markup.make_element(
         "details",
         markup.make_element("summary", "Open this page on a phone"),
-        markup.make_element("div", content, class_="qr"),
+        markup.make_element("div", _make_qr_element(address), class_="qr"),
         markup.make_element("pre", address, class_="wrap", tabindex="0"),
+    )
+
+
+def _make_qr_element(address: str) -> markup.Html:
+    """Return the QR code of an address; without the package for it, a sentence."""
+    code = markup.make_qr_code(address)
+    if code:
+        title = "QR code of the address below"
+        return markup.Html(code.svg_inline(omitsize=True, light="#fff", title=title))
+    return markup.make_element(
+        "p", f"A code to point the phone at would stand here: {markup.NO_QR}"
     )
 
 
@@ -312,30 +345,39 @@ def make_agreement_table(table: PhotoAgreement) -> markup.Html:
     """
     if not table.photos or table.interval is None:
         return markup.make_element("p", "No photographs yet.", class_="soft")
+    by_rendering = markup.make_element(
+        "div",
+        _rendering_table(table.renderings),
+        class_="scroll",
+        tabindex="0",
+        role="region",
+        aria_label="by rendering",
+    )
+    return markup.join_html(
+        markup.make_element("div", _make_outcome_table(table), class_="agreement"),
+        markup.make_element("p", _describe_photo_agreement(table)),
+        by_rendering,
+    )
+
+
+def _make_outcome_table(table: PhotoAgreement) -> markup.Html:
+    """Make the table of how many photographs and renderings are right and wrong."""
     heads = ("photographs", "right in the photograph", "wrong in the photograph")
     counts = [
         ["right in the rendering", str(table.right_right), str(table.right_wrong)],
         ["wrong in the rendering", str(table.wrong_right), str(table.wrong_wrong)],
     ]
+    return markup.make_table(heads, counts)
+
+
+def _describe_photo_agreement(table: PhotoAgreement) -> str:
+    """Describe in how many photographs predictions agree; there is at least one."""
+    assert table.interval is not None
     n_agreeing = table.right_right + table.wrong_wrong
-    text = (
+    return (
         f"They agree in {n_agreeing} of {wording.format_count(table.photos, 'photograph')}: "
         f"{wording.percent(table.agreement)}, 95 % interval "
         f"{wording.format_interval(table.interval)}."
-    )
-    return markup.join_html(
-        markup.make_element(
-            "div", markup.make_table(heads, counts), class_="agreement"
-        ),
-        markup.make_element("p", text),
-        markup.make_element(
-            "div",
-            _rendering_table(table.renderings),
-            class_="scroll",
-            tabindex="0",
-            role="region",
-            aria_label="by rendering",
-        ),
     )
 
 
@@ -354,24 +396,27 @@ def _rendering_table(renderings: Sequence[PhotographedRendering]) -> markup.Html
         "agree",
         "interval",
     ]
-    rows = []
-    for rendering in renderings:
-        outcome = "right" if rendering.rendering_right else "wrong"
-        rows.append(
-            [
-                rendering.rendering,
-                *([rendering.model] if has_models else []),
-                f"{outcome}: {rendering.label}",
-                _photographs_cell(rendering),
-                f"{rendering.agreeing} of {rendering.photos}",
-                wording.format_interval(rendering.interval),
-            ]
-        )
+    rows = [_make_rendering_row(rendering, has_models) for rendering in renderings]
     addresses = [
         f"renderings/{markup.quote_name(rendering.rendering)}"
         for rendering in renderings
     ]
     return markup.make_table(heads, rows, addresses)
+
+
+def _make_rendering_row(
+    rendering: PhotographedRendering, has_models: bool
+) -> list[str]:
+    """Return the cells of a rendering; the model is the second if the table has it."""
+    outcome = "right" if rendering.rendering_right else "wrong"
+    return [
+        rendering.rendering,
+        *([rendering.model] if has_models else []),
+        f"{outcome}: {rendering.label}",
+        _photographs_cell(rendering),
+        f"{rendering.agreeing} of {rendering.photos}",
+        wording.format_interval(rendering.interval),
+    ]
 
 
 def _photographs_cell(rendering: PhotographedRendering) -> markup.Html:

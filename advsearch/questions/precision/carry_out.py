@@ -38,6 +38,7 @@ from advsearch.questions.precision.result import (
     Machine,
     PrecisionConfig,
     PrecisionPoint,
+    PrecisionReference,
     PrecisionResult,
     PrecisionSlope,
     Recommended,
@@ -47,6 +48,7 @@ from advsearch.questions.precision.result import (
 )
 from advsearch.questions.precision.rule import (
     RoundUp,
+    SampleSetting,
     confirm_recommendation,
     describe_disagreement,
     fit_line,
@@ -76,11 +78,7 @@ def measure_precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
     """
     config = context.config
     start_time = time.perf_counter()
-    hint = f"then {config.seconds:g} seconds of measurements; `seconds` sets them"
-    context.progress.stage(workbench.LOADING, hint=hint)
-    problem, remarks = workbench.problem_from_config(config)
-    for remark in remarks:
-        context.progress.message(remark)
+    problem = _load_measured_problem(context)
     measurer = QuantityMeasurer(config, problem, context.progress)
     # sittings that are stored in the run, such as those of a resumed run
     measurements = context.open_measurements()
@@ -101,6 +99,17 @@ def measure_precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
     return result.model_copy(update={"figures": [str(path) for path in paths]})
 
 
+def _load_measured_problem(context: RunContext[PrecisionConfig]) -> Problem:
+    """Load the scene and the model, and show what is remarkable about them."""
+    config = context.config
+    hint = f"then {config.seconds:g} seconds of measurements; `seconds` sets them"
+    context.progress.stage(workbench.LOADING, hint=hint)
+    problem, remarks = workbench.problem_from_config(config)
+    for remark in remarks:
+        context.progress.message(remark)
+    return problem
+
+
 def _make_result(
     context: RunContext[PrecisionConfig],
     measurer: QuantityMeasurer,
@@ -117,15 +126,11 @@ def _make_result(
     """
     config = context.config
     problem = measurer.problem
-
-    def join(name: str) -> list[Any]:
-        """Join the lists in this field of all sittings."""
-        return [row for sitting in sittings for row in getattr(sitting, name)]
-
-    points = join("points")
+    points = _join_lists(sittings, "points")
     # lines of log error against log samples, and a sentence for each line that
     # disagrees with theory
     slopes, disagreements = _fit_slopes(points, measurer.may_be_steeper)
+    warnings = [*_join_lists(sittings, "warnings"), *disagreements]
     return context.result(
         PrecisionResult,
         model=problem.model.name,
@@ -138,19 +143,20 @@ def _make_result(
         machine=Machine(**context.machine, threads=count_threads()),
         points=points,
         slopes=slopes,
-        references=join("references"),
-        left_out=join("left_out"),
-        warnings=[*join("warnings"), *disagreements, *list_cautions(points)],
-        recommendations=recommend_settings(
-            points,
-            confirmations=join("confirmations"),
-            goal=config.error,
-            round_up=measurer.round_up_samples,
-            or_steeper=measurer.may_be_steeper,
+        references=_join_lists(sittings, "references"),
+        left_out=_join_lists(sittings, "left_out"),
+        warnings=[*warnings, *list_cautions(points)],
+        recommendations=measurer.recommend(
+            points, _join_lists(sittings, "confirmations")
         ),
         figures=[],
         seconds={"budget": config.seconds, "setup": setup_seconds},
     )
+
+
+def _join_lists(sittings: Sequence[Sitting], name: str) -> list[Any]:
+    """Join the lists in the field of this name of all sittings."""
+    return [row for sitting in sittings for row in getattr(sitting, name)]
 
 
 def _fit_slopes(
@@ -226,14 +232,7 @@ class QuantityMeasurer:
         self._renderer = problem.renderer
         self._loss = cast(gradients.Loss, problem.compute_loss)
         if self._is_linear:
-            # The loss is a linear function of the raw image, so that theory predicts
-            # the slope of the error.
-            self._renderer = problem.renderer.copy_with(
-                denoiser="none", transfer="linear"
-            )
-            # Finite differences use steps over which outlines move by one pixel: over
-            # wider steps even this smooth loss is not linear.
-            self._renderer.plan = self._renderer.plan.with_pixel_steps()
+            self._renderer = _make_linear_renderer(problem)
             self._loss = gradients.make_smooth_loss(
                 self._renderer.formation.resolution, config.seed
             )
@@ -251,21 +250,28 @@ class QuantityMeasurer:
             fraction = TIME_FRACTIONS["image"]
             sittings.append(PlannedSitting("image", fraction, self._measure_image))
         if "gradient" in quantities:
-            parts = list_gradient_parts(
-                self._renderer.plan.groups, linear=self._is_linear
+            sittings += self._plan_gradients()
+        return sittings
+
+    def _plan_gradients(self) -> list[PlannedSitting]:
+        """Plan a sitting for each part of the gradient; their time is divided evenly.
+
+        Raises:
+            InputError: no control has a derivative.
+        """
+        parts = list_gradient_parts(self._renderer.plan.groups, linear=self._is_linear)
+        if not parts:
+            names = ",".join(self._config.controls)
+            raise InputError(
+                f"`controls` {names}: has no derivative; leave "
+                "gradient out of `quantities`"
             )
-            if not parts:
-                names = ",".join(self._config.controls)
-                raise InputError(
-                    f"`controls` {names}: has no derivative; leave "
-                    "gradient out of `quantities`"
-                )
-            # The time of all gradients is divided evenly.
-            fraction = TIME_FRACTIONS["gradient"] / len(parts)
-            for part in parts:
-                name = f"gradient of {part.name}"
-                measure_part = partial(self._measure_gradient, part)
-                sittings.append(PlannedSitting(name, fraction, measure_part))
+        fraction = TIME_FRACTIONS["gradient"] / len(parts)
+        sittings = []
+        for part in parts:
+            name = f"gradient of {part.name}"
+            measure_part = partial(self._measure_gradient, part)
+            sittings.append(PlannedSitting(name, fraction, measure_part))
         return sittings
 
     def measure_sittings(
@@ -323,6 +329,25 @@ class QuantityMeasurer:
             return None
         return sampler != "independent"
 
+    def recommend(
+        self,
+        points: Sequence[PrecisionPoint],
+        confirmations: Sequence[PrecisionPoint],
+    ) -> list[Recommended]:
+        """Return the fastest settings that reach the goal; see `recommend_settings`.
+
+        Args:
+            points: measured settings.
+            confirmations: gradient settings that were measured again.
+        """
+        return recommend_settings(
+            points,
+            confirmations=confirmations,
+            goal=self._config.error,
+            round_up=self.round_up_samples,
+            or_steeper=self.may_be_steeper,
+        )
+
     def _measure_image(self, budget: TimeBudget) -> Sitting:
         """Measure images and the model's margin on them."""
         problem = self.problem
@@ -358,27 +383,23 @@ class QuantityMeasurer:
             title, bench, budget.take_fraction(1.0 - confirm_fraction)
         )
         # one recommendation, since the gradient of this part is the only quantity here
-        (recommended,) = recommend_settings(
-            sitting.points,
-            confirmations=[],
-            goal=self._config.error,
-            round_up=self.round_up_samples,
-            or_steeper=self.may_be_steeper,
-        )
-        warnings = []
-        if budget.seconds_left > 0.0:
-            bias_warning = bench.check_bias(self._seed)
-            if bias_warning:
-                warnings.append(bias_warning)
-        confirmations = self._measure_again(title, bench, recommended, budget)
-        seconds = time.perf_counter() - start_time
-        return sitting.model_copy(
-            update={
-                "confirmations": confirmations,
-                "warnings": warnings,
-                "seconds": seconds,
-            }
-        )
+        (recommended,) = self.recommend(sitting.points, confirmations=[])
+        warnings = self._list_bias_warnings(bench, budget)
+        further_values = {
+            "confirmations": self._measure_again(title, bench, recommended, budget),
+            "warnings": warnings,
+            "seconds": time.perf_counter() - start_time,
+        }
+        return sitting.model_copy(update=further_values)
+
+    def _list_bias_warnings(
+        self, bench: GradientBench, budget: TimeBudget
+    ) -> list[str]:
+        """Return a warning if the reference is biased; empty if no time is left."""
+        if not budget.seconds_left > 0.0:
+            return []
+        bias_warning = bench.check_bias(self._seed)
+        return [bias_warning] if bias_warning else []
 
     def _measure_again(
         self,
@@ -415,13 +436,7 @@ class QuantityMeasurer:
             seed=seeds.derive_seed(self._seed, "confirm"),
             on_done=lambda _: advance(),
         )
-        samples = [
-            numbers["gradient"] for numbers in measured.results_by_setting[setting]
-        ]
-        if len(samples) < MIN_CONFIRMATIONS:
-            return []
-        reference_error = bench.get_reference_error(setting, "gradient")
-        return [summarize_samples(setting, samples, reference_error)]
+        return _summarize_confirmations(bench, setting, measured)
 
     def _measure_settings(
         self, title: str, bench: PictureBench | GradientBench, budget: TimeBudget
@@ -434,12 +449,7 @@ class QuantityMeasurer:
             budget: time of the references and the measurements.
         """
         start_time = time.perf_counter()
-        reference_budget = budget.take_fraction(REFERENCE_FRACTION)
-        references = bench.compute_references(
-            reference_budget,
-            self._seed,
-            self._begin_stage(f"{title}: references", reference_budget),
-        )
+        references = self._compute_bench_references(title, bench, budget)
         advance = self._begin_stage(
             f"{title}: measuring every setting in rounds", budget
         )
@@ -456,6 +466,17 @@ class QuantityMeasurer:
             references=references,
             left_out=_describe_skipped(title, measured),
             seconds=time.perf_counter() - start_time,
+        )
+
+    def _compute_bench_references(
+        self, title: str, bench: PictureBench | GradientBench, budget: TimeBudget
+    ) -> list[PrecisionReference]:
+        """Compute the references of a bench within their fraction of a budget."""
+        reference_budget = budget.take_fraction(REFERENCE_FRACTION)
+        return bench.compute_references(
+            reference_budget,
+            self._seed,
+            self._begin_stage(f"{title}: references", reference_budget),
         )
 
     def _begin_stage(self, name: str, budget: TimeBudget) -> Callable[..., None]:
@@ -478,6 +499,30 @@ class QuantityMeasurer:
             done = passed
 
         return advance
+
+
+def _make_linear_renderer(problem: Problem) -> gradients.Renderer:
+    """Make a renderer of raw images, of which a linear loss is computed.
+
+    The loss is a linear function of the raw image, so that theory predicts the slope
+    of the error.
+    """
+    renderer = problem.renderer.copy_with(denoiser="none", transfer="linear")
+    # Finite differences use steps over which outlines move by one pixel: over
+    # wider steps even this smooth loss is not linear.
+    renderer.plan = renderer.plan.with_pixel_steps()
+    return renderer
+
+
+def _summarize_confirmations(
+    bench: GradientBench, setting: SampleSetting, measured: MeasuredRounds
+) -> list[PrecisionPoint]:
+    """Return a list with the point of the setting; empty without enough measurements."""
+    samples = [numbers["gradient"] for numbers in measured.results_by_setting[setting]]
+    if len(samples) < MIN_CONFIRMATIONS:
+        return []
+    reference_error = bench.get_reference_error(setting, "gradient")
+    return [summarize_samples(setting, samples, reference_error)]
 
 
 def _summarize_settings(
@@ -548,7 +593,31 @@ def recommend_settings(
         or_steeper: returns whether the error of a point may fall faster than that of
             independent samples; None if theory predicts nothing.
     """
-    # one candidate for each estimator, by quantity, control and family
+    recommended = []
+    candidates = _list_candidates(points, goal, round_up, or_steeper)
+    for (quantity, control, family), comparable in candidates.items():
+        best = min(
+            comparable,
+            # Every candidate has seconds; `or` is only for the type of the field.
+            key=lambda candidate: candidate.seconds or 0.0,
+            default=Recommended(quantity=quantity, control=control),
+        )
+        if quantity == "gradient":
+            best = _confirm_gradient(best, confirmations, round_up)
+        recommended.append(best.model_copy(update={"family": family}))
+    return recommended
+
+
+def _list_candidates(
+    points: Sequence[PrecisionPoint],
+    goal: float,
+    round_up: RoundUp,
+    or_steeper: Callable[[PrecisionPoint], bool | None],
+) -> dict[tuple[str, str, str], list[Recommended]]:
+    """Return a candidate for each estimator that reaches the goal.
+
+    They are by quantity, control and family; arguments as for `recommend_settings`.
+    """
     candidates: dict[tuple[str, str, str], list[Recommended]] = {}
     for line in group_by_line(points).values():
         first = line[0]
@@ -558,21 +627,18 @@ def recommend_settings(
         candidate = recommend_spp(line, goal, round_up, or_steeper(first))
         if candidate:
             comparable.append(candidate)
-    recommended = []
-    for (quantity, control, family), comparable in candidates.items():
-        best = min(
-            comparable,
-            # Every candidate has seconds; `or` is only for the type of the field.
-            key=lambda candidate: candidate.seconds or 0.0,
-            default=Recommended(quantity=quantity, control=control),
-        )
-        if quantity == "gradient":
-            for point in confirmations:
-                measured = (point.control, point.estimator)
-                if measured == (best.control, best.estimator):
-                    best = confirm_recommendation(best, point, round_up)
-        recommended.append(best.model_copy(update={"family": family}))
-    return recommended
+    return candidates
+
+
+def _confirm_gradient(
+    best: Recommended, confirmations: Sequence[PrecisionPoint], round_up: RoundUp
+) -> Recommended:
+    """Return a recommendation for a gradient after its setting was measured again."""
+    for point in confirmations:
+        measured = (point.control, point.estimator)
+        if measured == (best.control, best.estimator):
+            best = confirm_recommendation(best, point, round_up)
+    return best
 
 
 def count_threads() -> dict[str, int]:

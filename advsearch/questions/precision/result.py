@@ -339,19 +339,29 @@ def _make_parts(result: PrecisionResult) -> list[ResultPart]:
         # On a page this note is at the table of references instead.
         ResultPart(text=[READING_NOTE], only_medium="text"),
         *error_tables,
-        ResultPart.make_table(
-            result.slopes,
-            SLOPE_COLUMNS,
-            title="Slopes: logarithm of the error against that of samples",
-        ),
-        ResultPart.make_table(
-            result.references,
-            REFERENCE_COLUMNS,
-            title="References, with their own errors",
-            note=READING_NOTE,
-        ),
+        _make_slope_table(result),
+        _make_reference_table(result),
         ResultPart("Not measured for lack of time", result.left_out),
     ]
+
+
+def _make_slope_table(result: PrecisionResult) -> ResultPart:
+    """Make the table of how fast the error of each estimator falls with its samples."""
+    return ResultPart.make_table(
+        result.slopes,
+        SLOPE_COLUMNS,
+        title="Slopes: logarithm of the error against that of samples",
+    )
+
+
+def _make_reference_table(result: PrecisionResult) -> ResultPart:
+    """Make the table of the references that errors are measured against."""
+    return ResultPart.make_table(
+        result.references,
+        REFERENCE_COLUMNS,
+        title="References, with their own errors",
+        note=READING_NOTE,
+    )
 
 
 def make_headline(result: PrecisionResult) -> str:
@@ -397,14 +407,6 @@ def list_cautions(points: Sequence[PrecisionPoint]) -> list[str]:
     """
     # Heavy tails: a few pixels have most of the error.
     heavy = sorted({point.estimator for point in points if point.heavy_tailed})
-    # For each point with a time by the clock (`wall_seconds`): whether that is over
-    # twice the processor time (`seconds`).
-    waited = [
-        point.wall_seconds > 2.0 * point.seconds
-        for point in points
-        if point.wall_seconds is not None
-    ]
-    is_busy = sum(waited) > len(waited) / 2
     warnings = []
     if heavy:
         warnings.append(
@@ -412,7 +414,7 @@ def list_cautions(points: Sequence[PrecisionPoint]) -> list[str]:
             "that a few repeats do not show its size and there is no interval; a "
             "denoiser or more `rounds` help"
         )
-    if is_busy:
+    if _is_machine_busy(points):
         warnings.append(
             "the machine was busy with other programs: by the clock, most images and "
             "gradients took over twice their processor time; measure again when it is "
@@ -421,39 +423,54 @@ def list_cautions(points: Sequence[PrecisionPoint]) -> list[str]:
     return warnings
 
 
+def _is_machine_busy(points: Sequence[PrecisionPoint]) -> bool:
+    """Return whether most measurements waited for other programs."""
+    # For each point with a time by the clock (`wall_seconds`): whether that is over
+    # twice the processor time (`seconds`).
+    waited = [
+        point.wall_seconds > 2.0 * point.seconds
+        for point in points
+        if point.wall_seconds is not None
+    ]
+    return sum(waited) > len(waited) / 2
+
+
+ERROR_COLUMNS: Mapping[str, views.Column] = {
+    "control": "{0.control}",
+    "estimator": "{0.estimator}",
+    "samples": "{0.spp}",
+    "error": lambda point: (
+        f"{'' if point.has_known_error else '< '}{100 * point.rms_error:.3g} %"
+    ),
+    "95 %": lambda point: (
+        "heavy tails" if point.heavy_tailed else _format_interval(point.interval)
+    ),
+    "cosine": lambda point: f"{math.nan if point.cosine is None else point.cosine:.3f}",
+    "seconds": "{0.seconds:.3g}",
+    "repeats": "{0.repeats}",
+}
+"""Columns of a table of errors: format strings, or functions, of a point."""
+GRADIENT_COLUMNS = ("control", "cosine")
+"""Those that only gradients have."""
+
+
 def _make_error_table(quantity: str, points: Sequence[PrecisionPoint]) -> ResultPart:
     """Make the table of errors of a quantity.
 
-    Only gradients have a control and a cosine. If the error of a point is not known
-    (`is_known`), its root mean square is an upper limit, which is printed with "<".
-    Columns are format strings, or functions, of a point.
+    If the error of a point is not known (`has_known_error`), its root mean square is an
+    upper limit, which is printed with "<".
 
     Args:
         quantity: "picture", "margin" or "gradient".
         points: points of all quantities.
     """
     rows = [point for point in points if point.quantity == quantity]
-    columns: dict[str, views.Column] = (
-        {"control": "{0.control}"} if quantity == "gradient" else {}
-    )
-    columns |= {
-        "estimator": "{0.estimator}",
-        "samples": "{0.spp}",
-        "error": lambda point: (
-            f"{'' if point.has_known_error else '< '}{100 * point.rms_error:.3g} %"
-        ),
-        "95 %": lambda point: (
-            "heavy tails" if point.heavy_tailed else _format_interval(point.interval)
-        ),
+    columns = {
+        name: column
+        for name, column in ERROR_COLUMNS.items()
+        if quantity == "gradient" or name not in GRADIENT_COLUMNS
     }
-    if quantity == "gradient":
-        columns["cosine"] = lambda point: (
-            f"{math.nan if point.cosine is None else point.cosine:.3f}"
-        )
-    columns["seconds"] = "{0.seconds:.3g}"
-    return ResultPart.make_table(
-        rows, {**columns, "repeats": "{0.repeats}"}, title=quantity.capitalize()
-    )
+    return ResultPart.make_table(rows, columns, title=quantity.capitalize())
 
 
 def _format_interval(interval: results.Interval | None) -> str:
@@ -491,20 +508,11 @@ def draw_figures(result: PrecisionResult) -> figures.Figures:
     the reference has a similar error. The dashed line has the slope of the error of
     independent samples. The result is empty if no error is known.
     """
-    panels: dict[str, list[PrecisionPoint]] = {}
-    for point in result.points:
-        title = f"gradient: {point.control}" if point.control else point.quantity
-        if 0.0 < point.rms_error < math.inf:
-            panels.setdefault(title, []).append(point)
+    panels = _group_by_panel(result.points)
     if not panels:
         return {}
     n_columns = min(2, len(panels))
     n_rows = math.ceil(len(panels) / n_columns)
-    (height, width) = result.image_formation.resolution
-    headline = (
-        f"{result.object} in {result.environment}, {result.model}, {width} x "
-        f"{height} pixels"
-    )
 
     def draw(figure: Any) -> None:
         """Draw a panel for each quantity, in rows of two, under the headline."""
@@ -512,13 +520,35 @@ def draw_figures(result: PrecisionResult) -> figures.Figures:
             axes = figure.add_subplot(n_rows, n_columns, number)
             axes.set_title(title)
             _draw_errors(axes, panel_points, result)
-        figure.suptitle(headline, fontsize=11, fontweight="bold", x=0.01, ha="left")
-        caption = _make_caption(result)
-        figure.supxlabel(caption, fontsize=8, color=GREY, x=0.01, ha="left")
+        _draw_titles(figure, result)
 
     return figures.render_figure(
         draw, (PANEL_SIZE[0] * n_columns, PANEL_SIZE[1] * n_rows + 0.8)
     )
+
+
+def _group_by_panel(
+    points: Sequence[PrecisionPoint],
+) -> dict[str, list[PrecisionPoint]]:
+    """Return the points that can be drawn, by the title of their panel."""
+    panels: dict[str, list[PrecisionPoint]] = {}
+    for point in points:
+        title = f"gradient: {point.control}" if point.control else point.quantity
+        if 0.0 < point.rms_error < math.inf:
+            panels.setdefault(title, []).append(point)
+    return panels
+
+
+def _draw_titles(figure: Any, result: PrecisionResult) -> None:
+    """Write the headline over the diagrams, and their caption below."""
+    (height, width) = result.image_formation.resolution
+    headline = (
+        f"{result.object} in {result.environment}, {result.model}, {width} x "
+        f"{height} pixels"
+    )
+    figure.suptitle(headline, fontsize=11, fontweight="bold", x=0.01, ha="left")
+    caption = _make_caption(result)
+    figure.supxlabel(caption, fontsize=8, color=GREY, x=0.01, ha="left")
 
 
 def _make_caption(result: PrecisionResult) -> str:
@@ -530,24 +560,32 @@ def _make_caption(result: PrecisionResult) -> str:
         thread = "thread" if count == 1 else "threads"
         thread_counts.append(f"{count} {name} {thread}")
     threads = ", ".join(thread_counts)
-    # `median_time` leaves out the times of warm-up calls. With few repeats it uses only
-    # the last one.
-    max_repeats = max(point.repeats for point in result.points)
-    max_timed_repeats = max_repeats - WARM_UP_CALLS
-    if max_timed_repeats > 1:
-        seconds = f"medians of at most {max_timed_repeats} interleaved repeats"
-    else:
-        seconds = f"of the last of {max_repeats} repeats at most"
-    legend = "Filled: known"
-    if any(point.interval for point in result.points):
-        legend += ", with its 95 % interval"
-    legend += "."
-    if not all(point.has_known_error for point in result.points):
-        legend += " Open, with an arrow: an upper limit, the reference is no better."
     return (
         f"{machine.cpu}, {machine.cores} cores, {threads}; seconds are "
-        f"{seconds}.\n{legend}"
+        f"{_describe_timing(result.points)}.\n{_describe_markers(result.points)}"
     )
+
+
+def _describe_timing(points: Sequence[PrecisionPoint]) -> str:
+    """Describe of which repeats the seconds in the diagrams are."""
+    # `median_time` leaves out the times of warm-up calls. With few repeats it uses only
+    # the last one.
+    max_repeats = max(point.repeats for point in points)
+    max_timed_repeats = max_repeats - WARM_UP_CALLS
+    if max_timed_repeats > 1:
+        return f"medians of at most {max_timed_repeats} interleaved repeats"
+    return f"of the last of {max_repeats} repeats at most"
+
+
+def _describe_markers(points: Sequence[PrecisionPoint]) -> str:
+    """Describe what the markers in the diagrams stand for."""
+    legend = "Filled: known"
+    if any(point.interval for point in points):
+        legend += ", with its 95 % interval"
+    legend += "."
+    if not all(point.has_known_error for point in points):
+        legend += " Open, with an arrow: an upper limit, the reference is no better."
+    return legend
 
 
 def _draw_errors(
@@ -560,32 +598,19 @@ def _draw_errors(
         points: points of one quantity, and of one control if it is a gradient.
         result: result with these points, and with the slopes and the goal.
     """
-    quantity = points[0].quantity
-    control = points[0].control
-    slopes = {
-        slope.estimator: slope
-        for slope in result.slopes
-        if (slope.quantity, slope.control) == (quantity, control)
-    }
-    estimators = dict.fromkeys(point.estimator for point in points)
-    for number, estimator in enumerate(estimators):
-        line = sorted(
-            (point for point in points if point.estimator == estimator),
-            key=lambda point: point.spp,
-        )
-        label = _make_label(estimator, slopes.get(estimator))
-        _draw_line(axes, line, number, label)
-    axes.set(
-        xscale="log",
-        yscale="log",
-        xlabel="seconds of processor time",
-        ylabel="relative error, %",
-    )
+    _draw_estimators(axes, points, result.slopes)
+    axes.set(xscale="log", yscale="log")
+    axes.set(xlabel="seconds of processor time", ylabel="relative error, %")
     _draw_theory(axes, points)
     _plain_axis(axes.xaxis)
     _plain_axis(axes.yaxis)
     _draw_goal(axes, result.goal * PERCENT)
     axes.grid(True, which="major")
+    _add_slope_legend(axes)
+
+
+def _add_slope_legend(axes: Any) -> None:
+    """Add the legend of the estimators, with their slopes, to the right of the axes."""
     axes.legend(
         loc="upper left",
         bbox_to_anchor=(1.0, 1.0),
@@ -595,6 +620,33 @@ def _draw_errors(
         title_fontsize=8,
         alignment="left",
     )
+
+
+def _draw_estimators(
+    axes: Any, points: Sequence[PrecisionPoint], slopes: Sequence[PrecisionSlope]
+) -> None:
+    """Draw the points of each estimator, with its slope in the legend.
+
+    Args:
+        axes: axes of matplotlib.
+        points: points of one quantity, and of one control if it is a gradient.
+        slopes: slopes of all quantities.
+    """
+    quantity = points[0].quantity
+    control = points[0].control
+    slope_of_estimator = {
+        slope.estimator: slope
+        for slope in slopes
+        if (slope.quantity, slope.control) == (quantity, control)
+    }
+    estimators = dict.fromkeys(point.estimator for point in points)
+    for number, estimator in enumerate(estimators):
+        line = sorted(
+            (point for point in points if point.estimator == estimator),
+            key=lambda point: point.spp,
+        )
+        label = _make_label(estimator, slope_of_estimator.get(estimator))
+        _draw_line(axes, line, number, label)
 
 
 def _make_label(name: str, slope: PrecisionSlope | None) -> str:
@@ -636,8 +688,17 @@ def _draw_theory(axes: Any, points: Sequence[PrecisionPoint]) -> None:
     # slope
     smallest_scale = min(point.rms_error * math.sqrt(point.seconds) for point in points)
     scale = PERCENT * smallest_scale * 0.8  # a little under that point
-    # the middle of the range on a logarithmic axis
-    center = math.sqrt(start * end)
+    _draw_half_slope(axes, start, end, scale)
+
+
+def _draw_half_slope(axes: Any, start: float, end: float, scale: float) -> None:
+    """Draw the dashed line error = scale / sqrt(seconds), with its slope.
+
+    Args:
+        axes: axes of matplotlib, logarithmic.
+        start, end: the seconds that it spans.
+        scale: error in percent at one second.
+    """
     axes.plot(
         [start, end],
         [scale / math.sqrt(start), scale / math.sqrt(end)],
@@ -645,6 +706,8 @@ def _draw_theory(axes: Any, points: Sequence[PrecisionPoint]) -> None:
         linewidth=1.0,
         linestyle="--",
     )
+    # the middle of the range on a logarithmic axis
+    center = math.sqrt(start * end)
     axes.annotate(
         f"{MINUS}1/2",
         (center, scale / math.sqrt(center)),
@@ -670,25 +733,14 @@ def _draw_line(
     """
     color = COLORS[number % len(COLORS)]
     marker = MARKERS[number % len(MARKERS)]
-    axes.plot(
-        [point.seconds for point in line],
-        [PERCENT * point.rms_error for point in line],
-        color=color,
-        linewidth=1.0,
-        alpha=0.55,
-    )
+    seconds = [point.seconds for point in line]
+    errors = [PERCENT * point.rms_error for point in line]
+    axes.plot(seconds, errors, color=color, linewidth=1.0, alpha=0.55)
     for point in line:
         _draw_point(axes, point, color, marker)
-    axes.plot(
-        # an empty line, which adds an entry with marker and line to the legend
-        [],
-        [],
-        marker=marker,
-        markersize=5,
-        color=color,
-        linewidth=1.0,
-        label=label,
-    )
+    style = {"color": color, "marker": marker, "markersize": 5, "linewidth": 1.0}
+    # an empty line, which adds an entry with marker and line to the legend
+    axes.plot([], [], label=label, **style)
 
 
 def _draw_point(axes: Any, point: PrecisionPoint, color: str, marker: str) -> None:
@@ -717,29 +769,41 @@ def _draw_point(axes: Any, point: PrecisionPoint, color: str, marker: str) -> No
         markerfacecolor=color if point.has_known_error else "white",
     )
     if not point.has_known_error:
-        arrow = {
-            "arrowstyle": "-|>",
-            "color": color,
-            "linewidth": 0.8,
-            "shrinkA": 3,
-        }
-        # On a logarithmic axis, a factor gives all arrows the same length.
-        arrow_tip = y * 0.72
-        axes.annotate("", (x, arrow_tip), (x, y), arrowprops=arrow)
+        _draw_arrow_down(axes, x, y, color)
+
+
+def _draw_arrow_down(axes: Any, x: float, y: float, color: str) -> None:
+    """Draw an arrow down from a point of a logarithmic diagram."""
+    arrow = {
+        "arrowstyle": "-|>",
+        "color": color,
+        "linewidth": 0.8,
+        "shrinkA": 3,
+    }
+    # On a logarithmic axis, a factor gives all arrows the same length.
+    arrow_tip = y * 0.72
+    axes.annotate("", (x, arrow_tip), (x, y), arrowprops=arrow)
 
 
 def _plain_axis(axis: Any) -> None:
-    """Set ticks at round numbers, with labels as plain numbers.
+    """Set ticks at round numbers, with labels as plain numbers."""
+    # Importing it takes long.
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
+
+    low, high = sorted(axis.get_view_interval())
+    axis.set_major_locator(FixedLocator(_choose_ticks(low, high)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _choose_ticks(low: float, high: float) -> list[float]:
+    """Return round numbers between two bounds of a logarithmic axis.
 
     The usual ticks of a logarithmic axis are powers of ten, but a narrow range may have
     only one of these. So ticks are factors times powers of ten. The first list of
     factors that gives three ticks is used: a wide range has powers of ten only, and a
     narrow one has denser ticks.
     """
-    # Importing it takes long.
-    from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
-
-    low, high = sorted(axis.get_view_interval())
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     finest = [1.0 + 0.2 * k for k in range(45)]  # 1.0 to 9.8
     for factors in (
@@ -756,6 +820,4 @@ def _plain_axis(axis: Any) -> None:
         ]
         if len(ticks) >= 3:
             break
-    axis.set_major_locator(FixedLocator(ticks))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
-    axis.set_minor_formatter(NullFormatter())
+    return ticks

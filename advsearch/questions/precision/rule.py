@@ -166,23 +166,47 @@ def estimate_reference(
     # for each part, the function of the mean of all others
     jackknife_values = [function((total - part) / (count - 1)) for part in parts]
     center = np.mean(jackknife_values, axis=0)
+    scatter = _compute_scatter(jackknife_values, center)
+    noise_bias = _estimate_noise_bias(center - value, count, scatter)
+    norm = float(np.linalg.norm(value))
+    error = math.hypot(scatter, noise_bias, bias)
+    return ReferenceValue(
+        value, error=relative_error(error, norm), norm=norm, n_parts=count
+    )
+
+
+def _estimate_noise_bias(shift: Float64Array, count: int, scatter: float) -> float:
+    """Estimate the bias that noise causes in a value, as far as it is no chance.
+
+    Args:
+        shift: (m,) mean of the jackknife's values minus the value with all parts.
+        count: number of parts.
+        scatter: standard error of the value.
+    """
+    # Two parts are too few to estimate a bias.
+    bias_estimate = 0.0
+    if count > 2:
+        bias_estimate = (count - 1) * float(np.linalg.norm(shift))
+    # The estimate of the bias has about the same standard error as the value. So a bias
+    # up to this size may be chance, and the standard error is already counted.
+    return max(0.0, bias_estimate - scatter)
+
+
+def _compute_scatter(
+    jackknife_values: Sequence[Float64Array], center: Float64Array
+) -> float:
+    """Compute the jackknife's standard error of a value.
+
+    Args:
+        jackknife_values: the value (m,) without each part in turn.
+        center: (m,) their mean.
+    """
+    count = len(jackknife_values)
     sum_of_squares = sum(
         float(np.sum((jackknife_value - center) ** 2))
         for jackknife_value in jackknife_values
     )
-    scatter = math.sqrt((count - 1) / count * sum_of_squares)
-    # Two parts are too few to estimate a bias.
-    bias_estimate = 0.0
-    if count > 2:
-        bias_estimate = (count - 1) * float(np.linalg.norm(center - value))
-    # The estimate of the bias has about the same standard error as the value. So a bias
-    # up to this size may be chance, and the standard error is already counted.
-    bias_estimate = max(0.0, bias_estimate - scatter)
-    norm = float(np.linalg.norm(value))
-    error = math.hypot(scatter, bias_estimate, bias)
-    return ReferenceValue(
-        value, error=relative_error(error, norm), norm=norm, n_parts=count
-    )
+    return math.sqrt((count - 1) / count * sum_of_squares)
 
 
 def summarize_samples(
@@ -207,8 +231,7 @@ def summarize_samples(
     """
     squares = [numbers["error"] ** 2 for numbers in samples]
     mean_square = statistics.fmean(squares)
-    exceeds_reference = mean_square > (MIN_ERROR_RATIO * reference_error) ** 2
-    is_known = exceeds_reference and math.isfinite(mean_square) and mean_square > 0.0
+    is_known = _is_error_known(mean_square, reference_error)
     error = math.sqrt(mean_square)
     if is_known:
         error = math.sqrt(mean_square - reference_error**2)
@@ -216,9 +239,7 @@ def summarize_samples(
     is_heavy = is_heavy_tailed(samples)
     interval = None
     if is_known and not is_heavy and len(squares) > 1:
-        # The error has about the same relative deviation as the root mean square.
-        factor = _interval_factor(squares, mean_square)
-        interval = (error / factor, error * factor)
+        interval = _estimate_error_interval(error, squares)
     fields: dict[str, object] = {
         "repeats": len(samples),
         "status": "ok" if is_known else "reference unusable",
@@ -227,11 +248,24 @@ def summarize_samples(
         "reference_error": reference_error,
         "heavy_tailed": is_heavy,
         "cosine": _average_cosine(samples) if setting.quantity == "gradient" else None,
+        **_find_median_times(samples),
     }
-    for name in ("seconds", "wall_seconds"):
-        if name in samples[0]:
-            fields[name] = median_time([numbers[name] for numbers in samples])
     return PrecisionPoint.from_values({**vars(setting), **fields})
+
+
+def _is_error_known(mean_square: float, reference_error: float) -> bool:
+    """Return whether a mean square error is clearly larger than that of the reference."""
+    exceeds_reference = mean_square > (MIN_ERROR_RATIO * reference_error) ** 2
+    return exceeds_reference and math.isfinite(mean_square) and mean_square > 0.0
+
+
+def _find_median_times(samples: Sequence[Numbers]) -> dict[str, float]:
+    """Return the median of each of the times that the measurements have."""
+    return {
+        name: median_time([numbers[name] for numbers in samples])
+        for name in ("seconds", "wall_seconds")
+        if name in samples[0]
+    }
 
 
 def _average_cosine(samples: Sequence[Numbers]) -> float | None:
@@ -242,6 +276,17 @@ def _average_cosine(samples: Sequence[Numbers]) -> float | None:
 
 # upper limit of the logarithm of an interval's factor, so that exp does not overflow
 MAX_LOG_FACTOR = 50.0
+
+
+def _estimate_error_interval(
+    error: float, squares: Sequence[float]
+) -> tuple[float, float]:
+    """Return the interval of an error, from the squares of the measured errors.
+
+    The error has about the same relative deviation as the root of their mean.
+    """
+    factor = _interval_factor(squares, statistics.fmean(squares))
+    return error / factor, error * factor
 
 
 def _interval_factor(squares: Sequence[float], mean_square: float) -> float:
@@ -322,14 +367,10 @@ def fit_line(
     known = [point for point in points if point.has_known_error]
     if len({point.spp for point in known}) < MIN_FIT_POINTS:
         return None
-    line = linregress(
-        np.log([float(point.spp) for point in known]),
-        np.log([point.rms_error for point in known]),
-    )
+    log_counts = np.log([float(point.spp) for point in known])
+    line = linregress(log_counts, np.log([point.rms_error for point in known]))
     slope = float(line.slope)
-    # Student's t distribution; `len(known)` - 2, as the fit has two parameters
-    quantile = float(stdtrit(len(known) - 2, (1.0 + CONFIDENCE) / 2.0))
-    half_width = quantile * float(line.stderr)
+    half_width = _find_t_quantile(len(known)) * float(line.stderr)
     return PrecisionSlope(
         quantity=known[0].quantity,
         control=known[0].control,
@@ -342,6 +383,15 @@ def fit_line(
         or_steeper=bool(or_steeper),
         agrees=_agrees_with_theory(slope, half_width, or_steeper),
     )
+
+
+def _find_t_quantile(n_points: int) -> float:
+    """Return half the width of a slope's interval in units of its standard error.
+
+    It is a quantile of Student's t distribution. A line has two parameters, so that
+    `n_points` points leave `n_points` - 2 degrees of freedom.
+    """
+    return float(stdtrit(n_points - 2, (1.0 + CONFIDENCE) / 2.0))
 
 
 def _agrees_with_theory(
@@ -380,19 +430,23 @@ def describe_disagreement(
         return None
     # Slopes are negative: the smaller, the steeper.
     is_steeper = slope.slope <= slope.theory
-    if is_steeper:
-        reason = "the smallest sample counts are not in the asymptotic range yet"
-    elif has_leveled_off(points):
-        reason = "it levels off: there is a bias, which more samples do not remove"
-    else:
-        reason = "heavy-tailed noise, clipping with few samples, or a bias"
     return (
         f"{slope.control or slope.quantity} by {slope.estimator}: the error falls with "
         f"slope {slope.slope:.2f} against "
         f"samples (95 %: {slope.interval[0]:.2f} to {slope.interval[1]:.2f}), theory "
         f"predicts {slope.theory:g}"
-        f"{' or steeper' if slope.or_steeper else ''}: {reason}"
+        f"{' or steeper' if slope.or_steeper else ''}: "
+        f"{_explain_disagreement(is_steeper, points)}"
     )
+
+
+def _explain_disagreement(is_steeper: bool, points: Sequence[PrecisionPoint]) -> str:
+    """Return the most likely reason for a slope that disagrees with theory."""
+    if is_steeper:
+        return "the smallest sample counts are not in the asymptotic range yet"
+    if has_leveled_off(points):
+        return "it levels off: there is a bias, which more samples do not remove"
+    return "heavy-tailed noise, clipping with few samples, or a bias"
 
 
 def has_leveled_off(points: Sequence[PrecisionPoint]) -> bool:
@@ -455,27 +509,25 @@ def recommend_spp(
         return None
     ordered = sorted(points, key=lambda point: point.spp)
     line = fit_line(ordered)
-    is_explained = line is not None and _explains_points(line, ordered)
-    if line and is_explained:
-        count, basis = _solve_line(line, ordered, goal)
+    explaining_line = line if line and _explains_points(line, ordered) else None
+    if explaining_line:
+        count, basis = _solve_line(explaining_line, ordered, goal)
     else:
         count, basis = _interpolate_count(ordered, goal, line, or_steeper)
     if count is None:
         return None
     spp = round_up(ordered[0], count)
-    if line and is_explained:
-        error = _error_on_line(line, spp)
+    if explaining_line:
+        error = _error_on_line(explaining_line, spp)
     else:
         error = _interpolate_error(ordered, spp, line)
-    seconds = [point.seconds for point in ordered]
     return Recommended(
         quantity=ordered[0].quantity,
         control=ordered[0].control,
         goal=goal,
         estimator=ordered[0].estimator,
         spp=spp,
-        # slope 1: beyond the last point, time is proportional to samples
-        seconds=_interpolate_value(ordered, spp, seconds, slope=1.0),
+        seconds=_interpolate_seconds(ordered, spp),
         error=error,
         basis=basis,
     )
@@ -555,6 +607,13 @@ def _interpolate_error(
     return _interpolate_value(ordered, spp, errors, slope)
 
 
+def _interpolate_seconds(ordered: Sequence[PrecisionPoint], spp: int) -> float:
+    """Return the seconds at a sample count, interpolated between points."""
+    seconds = [point.seconds for point in ordered]
+    # slope 1: beyond the last point, time is proportional to samples
+    return _interpolate_value(ordered, spp, seconds, slope=1.0)
+
+
 def confirm_recommendation(
     recommendation: Recommended,
     point: PrecisionPoint,
@@ -622,11 +681,27 @@ def _interpolate_count(
         return _extrapolate_count(ordered, goal, line, or_steeper), "extrapolated"
     above = ordered[last_above]
     below = ordered[last_above + 1]
+    return _interpolate_count_between(above, below, goal), "interpolated"
+
+
+def _interpolate_count_between(
+    above: PrecisionPoint, below: PrecisionPoint, goal: float
+) -> float:
+    """Return the number of samples at which the error between two points is the goal.
+
+    Samples and error are interpolated on logarithmic axes.
+
+    Args:
+        above: point whose error is above the goal.
+        below: point with more samples, whose error is at most the goal.
+        goal: the relative error.
+    """
     # position of the goal between `above` (0) and `below` (1), on a logarithmic scale
     fraction = math.log(above.rms_error / goal) / math.log(
         above.rms_error / below.rms_error
     )
-    return above.spp * (below.spp / above.spp) ** fraction, "interpolated"
+    count: float = above.spp * (below.spp / above.spp) ** fraction
+    return count
 
 
 def _extrapolate_count(
@@ -650,11 +725,7 @@ def _extrapolate_count(
             not matter here.
     """
     last = ordered[-1]
-    slope = None
-    if line:
-        slope = line.slope
-    elif or_steeper is not None:
-        slope = MONTE_CARLO_SLOPE
+    slope = _choose_extrapolated_slope(line, or_steeper)
     # Slopes are negative: the larger, the flatter.
     is_too_flat = slope is not None and slope > MAX_FALLING_SLOPE
     if slope is None or is_too_flat:
@@ -666,6 +737,20 @@ def _extrapolate_count(
     # error ~ samples^slope, so samples ~ error^(1 / slope)
     factor = (goal / last.rms_error) ** (1.0 / used_slope)
     return last.spp * factor if factor <= MAX_EXTRAPOLATION else None
+
+
+def _choose_extrapolated_slope(
+    line: PrecisionSlope | None, or_steeper: bool | None
+) -> float | None:
+    """Return the slope of a line, or that of theory; None if neither is known.
+
+    Args:
+        line: fitted line; None if there is none.
+        or_steeper: None if theory predicts no slope.
+    """
+    if line:
+        return line.slope
+    return None if or_steeper is None else MONTE_CARLO_SLOPE
 
 
 def _interpolate_value(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from collections import defaultdict
@@ -100,36 +101,61 @@ def run_recipe(context: RunContext[RecipeConfig]) -> RecipeResult:
     Raises:
         InputError: before anything is written, if the recipe or its settings are wrong.
     """
-    config = context.config
+    _check_photograph_folder(context.config)
+    recipe = _load_recipe(context)
+    runs = _plan_checked_runs(recipe, context)
+    _write_recipe_note(recipe, context)
+    done, warnings = _run_parts(runs, context)
+    if any(result.is_unfinished for _, result in done):
+        context.ending = results.INTERRUPTED
+    else:
+        warnings += _compare_photographs(recipe, done, context)
+    recipe_figures = list(_write_figures(recipe, done, context))
+    for _, result in done:
+        warnings += getattr(result, "warnings", ())
+    return _make_result(recipe, done, recipe_figures, warnings, context)
+
+
+def _write_recipe_note(recipe: Recipe, context: RunContext[RecipeConfig]) -> None:
+    """Note the recipe in the run's store, from which a resumed run reads it."""
+    # For a resumed run this writes the same note again.
+    recipe_note = json.dumps(recipe.model_dump(mode="json"))
+    context.run.store.write_note(RECIPE_NOTE, recipe_note)
+
+
+def _check_photograph_folder(config: RecipeConfig) -> None:
+    """Raise an error if the folder of photographs is set and does not exist."""
     if config.photographs is not None and not Path(config.photographs).is_dir():
         raise InputError(f"photographs: expected a folder, got {config.photographs}")
-    recipe = _load_recipe(context)
+
+
+def _plan_checked_runs(
+    recipe: Recipe, context: RunContext[RecipeConfig]
+) -> list[PlannedRun]:
+    """Plan the runs of a recipe, and check what they and its figures name."""
+    config = context.config
     runs = plan_runs(recipe, config)
     description.check_powers(recipe, runs, config.recipe)
     is_new = _read_noted_recipe(context) is None
     if is_new:  # a resumed run was checked when it began
         check_recipe(recipe, config)
         check_figures(recipe, find_columns_of_parts(runs), config.recipe)
-    # For a resumed run this writes the same note again.
-    context.run.store.write_note(
-        RECIPE_NOTE, json.dumps(recipe.model_dump(mode="json"))
-    )
+    return runs
 
-    done, warnings = _run_parts(runs, context)
-    recipe_figures = list[RecipeFigure]()
 
-    if any(result.is_unfinished for _, result in done):
-        context.ending = results.INTERRUPTED
-    elif config.photographs is not None:
-        photographed = _select_photographed(recipe, [run for run, _ in done])
-        warnings += _add_photographs(
-            Path(config.photographs), photographed, context.run
-        )
-    if context.ending != results.INTERRUPTED:
-        recipe_figures = list(_write_figures(recipe, config, done, context.run))
-    for _, result in done:
-        warnings += getattr(result, "warnings", ())
-    return _make_result(recipe, done, recipe_figures, warnings, context)
+def _compare_photographs(
+    recipe: Recipe, done: Sequence[DoneRun], context: RunContext[RecipeConfig]
+) -> list[str]:
+    """Add the photographs of the settings, if any, to the finished runs.
+
+    Returns:
+        A sentence for each run without photographs.
+    """
+    folder = context.config.photographs
+    if folder is None:
+        return []
+    photographed = _select_photographed(recipe, [run for run, _ in done])
+    return _add_photographs(Path(folder), photographed, context.run)
 
 
 def _read_noted_recipe(context: RunContext[RecipeConfig]) -> dict[str, Any] | None:
@@ -175,17 +201,6 @@ def _make_result(
     config = context.config
     names = _list_scene_names(recipe, config)
     controls = [name for run, _ in done for name in run.config.controls]
-    parts = [
-        RecipePart(
-            name=run.name,
-            part=run.part_name,
-            command=run.config.command,
-            object=run.config.object,
-            ending=run_result.ending,
-            renders=sum(run_result.renders.values()),
-        )
-        for run, run_result in done
-    ]
     result = context.result(
         RecipeResult,
         recipe=config.recipe,
@@ -196,17 +211,38 @@ def _make_result(
         environment=",".join(names["environment"]),
         model=",".join(names["model"]),
         controls=list(dict.fromkeys(controls)),
-        parts=parts,
+        parts=[_make_recipe_part(run, run_result) for run, run_result in done],
         figures=recipe_figures,
         warnings=list(dict.fromkeys(warnings)),
     )
-    resumed = context.resumed_directory
+    _add_previous_seconds(result, context.resumed_directory)
+    return result
+
+
+def _make_recipe_part(run: PlannedRun, run_result: Any) -> RecipePart:
+    """Make the entry of one run in the result of its recipe."""
+    return RecipePart(
+        name=run.name,
+        part=run.part_name,
+        command=run.config.command,
+        object=run.config.object,
+        ending=run_result.ending,
+        renders=sum(run_result.renders.values()),
+    )
+
+
+def _add_previous_seconds(result: RecipeResult, resumed: Path | None) -> None:
+    """Add the seconds of a run before it was stopped to the total of its result.
+
+    Args:
+        result: the result, whose total changes.
+        resumed: directory of the run that is resumed; None for a new run.
+    """
     # A run that was killed has no summary, and its seconds are unknown.
     if resumed is not None and (resumed / "summary.json").is_file():
         previous = read_result(resumed)
         previous_seconds = getattr(previous, "seconds", {"total": 0.0})
         result.seconds["total"] += previous_seconds["total"]
-    return result
 
 
 def _list_scene_names(recipe: Recipe, config: RecipeConfig) -> dict[str, list[str]]:
@@ -237,18 +273,7 @@ def check_recipe(recipe: Recipe, config: RecipeConfig) -> None:
         InputError: if something that the recipe describes cannot work.
     """
     if config.photographs is not None:
-        photographed = _select_photographed(recipe, plan_runs(recipe, config))
-        if not photographed:
-            raise InputError(
-                f"photographs: {config.recipe} keeps no pictures to compare them with; "
-                "recipe realism does"
-            )
-        photographs = workbench.load_photographs()
-        for run in photographed:
-            # The photographs of an object are in a directory of its name.
-            directory = Path(config.photographs) / Path(run.config.object).stem
-            # only a check: raises if the task cannot evaluate a photograph
-            photographs.list_files(directory, run.config.task)
+        _check_photograph_runs(recipe, config)
     for figure in recipe.figures:
         kind, _ = read_figure_options(figure, config.recipe)  # checks the options, too
         if kind == "cues" and config.task_name == wording.DETECTION:
@@ -257,6 +282,27 @@ def check_recipe(recipe: Recipe, config: RecipeConfig) -> None:
                 "texture or of the shape, and "
                 "detection says whether the object is found; give it a classifier"
             )
+
+
+def _check_photograph_runs(recipe: Recipe, config: RecipeConfig) -> None:
+    """Check that the task of each run that photographs belong to can evaluate them.
+
+    Raises:
+        InputError: if it cannot, or there is no such run.
+    """
+    assert config.photographs is not None
+    photographed = _select_photographed(recipe, plan_runs(recipe, config))
+    if not photographed:
+        raise InputError(
+            f"photographs: {config.recipe} keeps no pictures to compare them with; "
+            "recipe realism does"
+        )
+    photographs = workbench.load_photographs()
+    for run in photographed:
+        # The photographs of an object are in a directory of its name.
+        directory = Path(config.photographs) / Path(run.config.object).stem
+        # only a check: raises if the task cannot evaluate a photograph
+        photographs.list_files(directory, run.config.task)
 
 
 def find_columns_of_parts(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
@@ -273,13 +319,7 @@ def find_columns_of_parts(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
     columns_of_part = defaultdict[str, set[str]](set)
     config_of_run = {run.name: run.config for run in runs}
     for run in runs:
-        distinct_settings = {
-            name: value
-            for name, value in run.config.to_json().items()
-            if name not in ("seed", WORKERS_COLUMN)
-        }
-        # A mapping has no hash, so its text is the key.
-        key = f"{distinct_settings} {run.search_run_name}"
+        key = _format_distinct_settings(run)
         if key not in columns_of_settings:
             # the search around whose distribution this run samples
             search = config_of_run[run.search_run_name] if run.search_run_name else None
@@ -288,6 +328,17 @@ def find_columns_of_parts(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
         if getattr(run.config, WORKERS_COLUMN, None) is not None:
             columns_of_part[run.part_name].add(WORKERS_COLUMN)
     return columns_of_part
+
+
+def _format_distinct_settings(run: PlannedRun) -> str:
+    """Return a text that is equal for runs that differ only in seed and workers."""
+    distinct_settings = {
+        name: value
+        for name, value in run.config.to_json().items()
+        if name not in ("seed", WORKERS_COLUMN)
+    }
+    # A mapping has no hash, so its text is the key.
+    return f"{distinct_settings} {run.search_run_name}"
 
 
 def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:
@@ -316,18 +367,22 @@ def _list_control_columns(config: SceneConfig) -> set[str]:
     columns = set[str]()
     # `over` are the controls of an attack that vary at random.
     for name in (*config.controls, *getattr(config, "over", {})):
-        kind = name.partition(":")[0]
-        parameters = []
-        if kind in workbench.CONTROLS:
-            parameters = [
-                parameter.name for parameter in workbench.CONTROLS[kind].parameters
-            ]
-        # A control that declares no parameters has some of the scene's, which are not
-        # known here.
-        if not parameters:
-            parameters = [ANY_PARAMETER]
-        columns |= {f"{name}.{parameter}" for parameter in parameters}
+        columns |= {f"{name}.{parameter}" for parameter in _list_parameters(name)}
     return columns
+
+
+def _list_parameters(control_name: str) -> list[str]:
+    """Return the names of the parameters that a control declares.
+
+    A control that declares no parameters has some of the scene's, which are not known
+    here: the list is `ANY_PARAMETER`.
+    """
+    kind = control_name.partition(":")[0]
+    parameters = []
+    if kind in workbench.CONTROLS:
+        declared = workbench.CONTROLS[kind].parameters
+        parameters = [parameter.name for parameter in declared]
+    return parameters or [ANY_PARAMETER]
 
 
 def check_figures(
@@ -346,28 +401,62 @@ def check_figures(
     for index, described in enumerate(recipe.figures, start=1):
         kind, options = read_figure_options(described, where)
         location = f"It stands in {where}, figure {index} ({kind})"
-        # The part that all others are compared with needs none of the columns.
-        baseline = getattr(options, "beside", None)
-        _check_option_parts(recipe, options, baseline, location)
-        parts = options.of or tuple(columns)  # by default all parts
-        columns_of_part = {
-            part: part_columns
-            for part, part_columns in columns.items()
-            if part in parts and part != baseline
-        }
-        if not columns_of_part:  # the figure shows only the baseline or photographs
-            continue
-        for option in COLUMN_OPTIONS:
-            value = getattr(options, option, None) or ()  # a name, or several
-            names = [value] if isinstance(value, str) else value
-            for name in names:
-                _check_column(
-                    recipe,
-                    name,
-                    option=option,
-                    columns_of_part=columns_of_part,
-                    location=location,
-                )
+        _check_figure(recipe, options, columns, location)
+
+
+def _check_figure(
+    recipe: Recipe,
+    options: Options,
+    columns: Mapping[str, Collection[str]],
+    location: str,
+) -> None:
+    """Check that the parts and columns that the options of a figure name exist.
+
+    Args:
+        recipe: the recipe.
+        options: options of the figure.
+        columns: names of columns by part.
+        location: location of the figure, for messages.
+    """
+    # The part that all others are compared with needs none of the columns.
+    baseline = getattr(options, "beside", None)
+    _check_option_parts(recipe, options, baseline, location)
+    parts = options.of or tuple(columns)  # by default all parts
+    columns_of_part = {
+        part: columns[part] for part in columns if part in parts and part != baseline
+    }
+    if columns_of_part:  # otherwise it shows only the baseline or photographs
+        _check_option_columns(recipe, options, columns_of_part, location)
+
+
+def _check_option_columns(
+    recipe: Recipe,
+    options: Options,
+    columns_of_part: Mapping[str, Collection[str]],
+    location: str,
+) -> None:
+    """Check that the parts of a figure have all columns that its options name.
+
+    Args:
+        recipe: the recipe.
+        options: options of the figure.
+        columns_of_part: names of columns of each part of the figure.
+        location: location of the figure, for messages.
+    """
+    common = _list_common_columns(recipe)
+    for option in COLUMN_OPTIONS:
+        value = getattr(options, option, None) or ()  # a name, or several
+        names = [value] if isinstance(value, str) else value
+        for name in names:
+            _check_column(name, option, common, columns_of_part, location)
+
+
+def _list_common_columns(recipe: Recipe) -> set[str]:
+    """Return the names of the columns that all parts of a recipe have."""
+    common = set(COMMON_COLUMNS)
+    if recipe.groups:
+        common.add(rates.GROUP_COLUMN)
+    return common
 
 
 def _check_option_parts(
@@ -393,49 +482,58 @@ def _check_option_parts(
 
 
 def _check_column(
-    recipe: Recipe,
     name: str,
     option: str,
+    common: Collection[str],
     columns_of_part: Mapping[str, Collection[str]],
     location: str,
 ) -> None:
     """Check that all parts of a figure have a column.
 
     Args:
-        recipe: the recipe; if it has groups, all parts have a column of the group.
         name: name of the column.
         option: option of the figure that names the column.
+        common: names of the columns that all parts have.
         columns_of_part: names of columns of each part of the figure.
         location: location of the figure, for messages.
 
     Raises:
         InputError: if no part has it, or only some have.
     """
-    common = set(COMMON_COLUMNS)  # columns that all parts have
-    if recipe.groups:
-        common.add(rates.GROUP_COLUMN)
     if name in common:
         return
-    # "mitsuba.*" stands for any parameter of the control "mitsuba".
-    control_name = name.partition(".")[0]
-    matching = {name, f"{control_name}.{ANY_PARAMETER}"}
-    lacking = [
-        part
-        for part, columns in columns_of_part.items()
-        if matching.isdisjoint(columns)
-    ]
+    lacking = _list_parts_without(name, columns_of_part)
     if len(lacking) == len(columns_of_part):
         # the columns that any part has, for the message
-        known = common.union(*columns_of_part.values())
-        known = {column for column in known if not column.endswith(ANY_PARAMETER)}
-        raise errors.UnknownNameError(
-            "column", name, known, f"{location}, as `{option}`."
-        )
+        known = set(common).union(*columns_of_part.values())
+        raise _make_unknown_column_error(name, known, f"{location}, as `{option}`.")
     if lacking:
         raise InputError(
             f"{location}: {lacking[0]} has no {name}; name the "
             "parts that have it as `of`"
         )
+
+
+def _make_unknown_column_error(
+    name: str, known: Collection[str], location: str
+) -> errors.UnknownNameError:
+    """Make the error that no part has a column, with the columns that are known."""
+    listed = {column for column in known if not column.endswith(ANY_PARAMETER)}
+    return errors.UnknownNameError("column", name, listed, location)
+
+
+def _list_parts_without(
+    column: str, columns_of_part: Mapping[str, Collection[str]]
+) -> list[str]:
+    """Return the names of the parts that certainly lack a column."""
+    # "mitsuba.*" stands for any parameter of the control "mitsuba".
+    control_name = column.partition(".")[0]
+    matching = {column, f"{control_name}.{ANY_PARAMETER}"}
+    return [
+        part
+        for part, columns in columns_of_part.items()
+        if matching.isdisjoint(columns)
+    ]
 
 
 def _select_photographed(
@@ -476,28 +574,47 @@ def _run_parts(
     done = list[DoneRun]()
     left_out = list[str]()
     for number, run in enumerate(runs, start=1):
-        config = run.config
-        context.progress.message(
-            f"run {number} of {len(runs)}: {run.part_name}, {config.object}"
-        )
-        if run.search_run_name is not None:
-            search: Any = read_result(
-                RunDirectory.locate_part(context.run.path, run.search_run_name)
-            )
-            if search.distribution is None:
-                left_out.append(
-                    f"{config.object}: the search ended with {search.ending!r} and no "
-                    "distribution, so that the part "
-                    f"{run.part_name} is left out for it."
-                )
-                continue
-            search_ranges = search.configuration or {}
-            config = sample_around(config, search.distribution, search_ranges)
-        result = context.run_part(run.name, config)
+        _report_run(run, f"run {number} of {len(runs)}", context)
+        search = _read_search(context, run.search_run_name)
+        if search is not None and search.distribution is None:
+            left_out.append(_describe_run_without_search(run, search.ending))
+            continue
+        result = context.run_part(run.name, _choose_config(run.config, search))
         done.append((run, result))
         if result.is_unfinished:
             break
     return done, left_out
+
+
+def _report_run(
+    run: PlannedRun, number: str, context: RunContext[RecipeConfig]
+) -> None:
+    """Report that a run begins: ``run 2 of 5: search, mug``; `number` comes first."""
+    context.progress.message(f"{number}: {run.part_name}, {run.config.object}")
+
+
+def _read_search(context: RunContext[RecipeConfig], name: str | None) -> Any:
+    """Read the result of a search that is a run of the recipe; None without a name."""
+    if name is None:
+        return None
+    return read_result(RunDirectory.locate_part(context.run.path, name))
+
+
+def _choose_config(config: SceneConfig, search: Any) -> SceneConfig:
+    """Return the settings of a run, around the distribution of its search, if any."""
+    if search is None:
+        return config
+    search_ranges = search.configuration or {}
+    return sample_around(config, search.distribution, search_ranges)
+
+
+def _describe_run_without_search(run: PlannedRun, search_ending: str) -> str:
+    """Describe that a run is left out, since its search found no distribution."""
+    return (
+        f"{run.config.object}: the search ended with {search_ending!r} and no "
+        "distribution, so that the part "
+        f"{run.part_name} is left out for it."
+    )
 
 
 def sample_around(
@@ -520,18 +637,17 @@ def sample_around(
         distribution.mean.items(), distribution.deviation, strict=True
     ):
         control, _, parameter_name = name.partition(".")
-        parameter = next(
-            known
-            for known in workbench.CONTROLS[control].parameters
-            if known.name == parameter_name
-        )
-        controls.setdefault(control, {})[parameter_name] = _range_around(
-            mean.value,
-            deviation,
-            (search_ranges[name].low, search_ranges[name].high),
-            parameter,
-        )
+        parameter = _find_parameter(control, parameter_name)
+        search_range = (search_ranges[name].low, search_ranges[name].high)
+        sampled_range = _range_around(mean.value, deviation, search_range, parameter)
+        controls.setdefault(control, {})[parameter_name] = sampled_range
     return config.model_copy(update={"controls": controls, "sampler": "random"})
+
+
+def _find_parameter(control: str, name: str) -> Any:
+    """Return a parameter that a control declares, by its name."""
+    parameters = workbench.CONTROLS[control].parameters
+    return next(parameter for parameter in parameters if parameter.name == name)
 
 
 def _range_around(
@@ -556,9 +672,8 @@ def _range_around(
     is_full_turn = parameter.periodic and upper - lower >= FULL_TURN
     if is_full_turn:  # an angle beyond the bounds is the same as one within them
         half_width = min(half_width, FULL_TURN / 2)
-        bounds = [center - half_width, center + half_width]
-    else:
-        bounds = [max(center - half_width, lower), min(center + half_width, upper)]
+        lower, upper = -math.inf, math.inf  # not clipped
+    bounds = [max(center - half_width, lower), min(center + half_width, upper)]
     if parameter.log:
         return [math.exp(bound) for bound in bounds]
     return bounds
@@ -586,45 +701,59 @@ def _add_photographs(
         object_name = planned_run.config.object
         directory = folder / Path(object_name).stem
         files = photographs.list_files(directory, planned_run.config.task)
-        part = RunDirectory.locate_part(run.path, planned_run.name)
-        photographs.add_files(part, files)
+        photographs.add_files(
+            RunDirectory.locate_part(run.path, planned_run.name), files
+        )
         if not files:
             missing.append(f"{object_name}: {directory} has no photographs.")
     if len(missing) == len(runs):
-        stems = [Path(planned_run.config.object).stem for planned_run in runs[:8]]
-        raise InputError(
-            "photographs: expected some in a folder for each object "
-            f"({', '.join(stems)}) in {folder}, got none"
-        )
+        raise _make_no_photographs_error(folder, runs)
     return missing
 
 
+def _make_no_photographs_error(folder: Path, runs: Sequence[PlannedRun]) -> InputError:
+    """Make the error that no run has photographs, with the folders that may have some."""
+    stems = [Path(planned_run.config.object).stem for planned_run in runs[:8]]
+    return InputError(
+        "photographs: expected some in a folder for each object "
+        f"({', '.join(stems)}) in {folder}, got none"
+    )
+
+
 def _write_figures(
-    recipe: Recipe,
-    config: RecipeConfig,
-    done: Sequence[DoneRun],
-    recipe_run: RunDirectory,
+    recipe: Recipe, done: Sequence[DoneRun], context: RunContext[RecipeConfig]
 ) -> Iterator[RecipeFigure]:
     """Write the images of all figures of a recipe, and yield their content.
 
+    There are no figures if the run was interrupted.
+
     Args:
         recipe: the recipe.
-        config: settings of the command.
         done: the finished runs with their results.
-        recipe_run: run directory of the recipe, which gets the images.
+        context: context of the recipe's run, whose directory gets the images.
     """
-    rows = _read_frame(recipe, done, recipe_run)
-    number = 0
-    # all options are read before the first figure is made
-    kinds = [
-        read_figure_options(described, config.recipe) for described in recipe.figures
-    ]
-    for kind, options in kinds:
+    if context.ending == results.INTERRUPTED:
+        return
+    rows = _read_frame(recipe, done, context.run)
+    numbers = itertools.count(1)
+    for kind, options in _read_all_figure_options(recipe, context.config.recipe):
         for figure in make_figures(rows, kind, options):
-            number += 1
-            for suffix, data in draw_files(figure).items():
-                recipe_run.write_file(f"images/figure-{number}.{suffix}", data)
+            _write_figure(figure, next(numbers), context.run)
             yield RecipeFigure.from_values({"figure": kind, **vars(figure)})
+
+
+def _read_all_figure_options(recipe: Recipe, where: str) -> list[tuple[str, Options]]:
+    """Return the kind and the options of each figure of a recipe.
+
+    `where` is the recipe's file or name, for messages.
+    """
+    return [read_figure_options(described, where) for described in recipe.figures]
+
+
+def _write_figure(figure: FigureContent, number: int, recipe_run: RunDirectory) -> None:
+    """Write the images of one figure, in all formats, into the run of the recipe."""
+    for suffix, data in draw_files(figure).items():
+        recipe_run.write_file(f"images/figure-{number}.{suffix}", data)
 
 
 def _read_frame(
@@ -643,40 +772,65 @@ def _read_frame(
     """
     rows = list[dict[str, Any]]()
     units = dict[str, str]()
-    surfaces = dict[str, Any]()
     for run, result in done:
-        # The kinds of stored rows that count for each part.
-        is_sweep = isinstance(run.config, SweepConfig)
-        row_kinds: dict[str, Sequence[str]] = {run.part_name: tuple(TRIAL_NAMES)}
-        if is_sweep:
-            row_kinds = {
-                run.part_name: ("sweep",),
-                PHOTOGRAPHS: workbench.load_photographs().row_kinds,
-            }
-            if result.surface:
-                surfaces[run.name] = result.surface
-        workers = getattr(run.config, WORKERS_COLUMN, None)
-        more_columns = {} if workers is None else {WORKERS_COLUMN: workers}
-        folder = RunDirectory.locate_part(recipe_run.path, run.name)
-        for part, kinds in row_kinds.items():
-            part_rows, part_units = read_rows(
-                part,
-                folder,
-                summary=result,
-                seed=run.config.seed,
-                kinds=kinds,
-                **more_columns,
-            )
-            rows += part_rows
-            units |= part_units
+        run_rows, run_units = _read_run_rows(run, result, recipe_run)
+        rows += run_rows
+        units |= run_units
     return make_frame(
         rows,
         recipe.groups,
         units=units,
-        surfaces=surfaces,
+        surfaces=_collect_surfaces(done),
         cores=workbench.count_cores(),
         folder=recipe_run.path,
     )
+
+
+def _collect_surfaces(done: Sequence[DoneRun]) -> dict[str, Any]:
+    """Return what sweeps found about the surface of their object, by name of the run.
+
+    Sweeps without the setting `surface` are left out.
+    """
+    return {
+        run.name: result.surface
+        for run, result in done
+        if isinstance(run.config, SweepConfig) and result.surface
+    }
+
+
+def _list_row_kinds(run: PlannedRun) -> dict[str, Sequence[str]]:
+    """Return the kinds of a run's stored rows that count for each part."""
+    if isinstance(run.config, SweepConfig):
+        return {
+            run.part_name: ("sweep",),
+            PHOTOGRAPHS: workbench.load_photographs().row_kinds,
+        }
+    return {run.part_name: tuple(TRIAL_NAMES)}
+
+
+def _read_run_rows(
+    run: PlannedRun, result: Any, recipe_run: RunDirectory
+) -> tuple[list[dict[str, Any]], dict[str, str]]:
+    """Read the rows of a run, each with its part, and the units of their columns.
+
+    Args:
+        run: the finished run.
+        result: its result.
+        recipe_run: run directory of the recipe.
+    """
+    rows = list[dict[str, Any]]()
+    units = dict[str, str]()
+    workers = getattr(run.config, WORKERS_COLUMN, None)
+    more_columns = {} if workers is None else {WORKERS_COLUMN: workers}
+    folder = RunDirectory.locate_part(recipe_run.path, run.name)
+    seed = run.config.seed
+    for part, kinds in _list_row_kinds(run).items():
+        part_rows, part_units = read_rows(
+            part, folder, summary=result, seed=seed, kinds=kinds, **more_columns
+        )
+        rows += part_rows
+        units |= part_units
+    return rows, units
 
 
 def read_figure_options(
@@ -691,11 +845,11 @@ def read_figure_options(
     Raises:
         InputError: if the kind or an option does not exist, or a value is wrong.
     """
-    kind = str(figure_entry.get("figure", ""))
+    values = dict(figure_entry)
+    kind = str(values.pop("figure", ""))
     if kind not in FIGURES:
         raise errors.UnknownNameError("figure", kind, FIGURES, f"It stands in {where}.")
     options_type, _ = FIGURES[kind]
-    values = {name: value for name, value in figure_entry.items() if name != "figure"}
     try:
         return kind, options_type(**values)
     except ValidationError as error:
@@ -719,8 +873,22 @@ def make_figures(rows: Rows, kind: str, options: Options) -> Iterator[FigureCont
     Raises:
         InputError: if the rows lack what the figure needs.
     """
-    part_of_row = rows[rates.PART_COLUMN]
     _, make_figure = FIGURES[kind]
+    rows_of_model = _split_selected_rows(rows, kind, options)
+    for model, model_rows in rows_of_model.items():
+        figure = make_figure(model_rows, options)
+        title = options.title or figure.title
+        if len(rows_of_model) > 1:
+            title = f"{title}: {model}"
+        yield replace(figure, title=title)
+
+
+def _split_selected_rows(rows: Rows, kind: str, options: Options) -> dict[str, Rows]:
+    """Select the rows that the figures of an entry show, by the model of each figure.
+
+    If one figure shows all models, its key is "".
+    """
+    part_of_row = rows[rates.PART_COLUMN]
     if options.required_parts:
         is_selected = part_of_row.isin(options.required_parts)
     else:
@@ -729,15 +897,9 @@ def make_figures(rows: Rows, kind: str, options: Options) -> Iterator[FigureCont
     # An option such as `by` or `series` may name the column of the models.
     shows_models = rates.MODEL_COLUMN in vars(options).values()
     compares_models = kind in COMPARES_MODELS or shows_models
-    rows_of_model = {"": selected}
     if not compares_models and rates.MODEL_COLUMN in selected:
-        rows_of_model = rates.split_rows(selected, rates.MODEL_COLUMN)
-    for model, model_rows in rows_of_model.items():
-        figure = make_figure(model_rows, options)
-        title = options.title or figure.title
-        if len(rows_of_model) > 1:
-            title = f"{title}: {model}"
-        yield replace(figure, title=title)
+        return rates.split_rows(selected, rates.MODEL_COLUMN)
+    return {"": selected}
 
 
 def draw_files(figure_content: FigureContent) -> dict[str, bytes]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from itertools import product
@@ -32,6 +32,21 @@ CONFIGS: Mapping[str, type[SceneConfig]] = {
 PHOTOGRAPHS = "photographs"
 COMMAND_SETTINGS = (*settings.RUN_LOCATION, "seed", "threads", "deterministic")
 """Settings that are given with the command and not in the file of a recipe."""
+# settings of a recipe that those of the command replace
+REPLACED_SETTINGS = (
+    "object",
+    "environment",
+    "model",
+    "labels",
+    "prompt",
+    "value_range",
+    "task",
+    "up",
+    "facing",
+    "size",
+    "unit",
+    "resolution",
+)
 
 MAX_PARTS = 64
 MAX_FIGURES = 32
@@ -127,15 +142,7 @@ class Recipe(_Described):
         """Check the names of parts, and that parts refer to earlier ones only."""
         earlier = list[str]()
         for name, part in value.items():
-            if not re.fullmatch(r"[a-z0-9][a-z0-9-]{0,39}", name):
-                raise ValueError(
-                    "expected names of small letters, digits and "
-                    f"hyphens, got {name[:40]!r}"
-                )
-            if name == PHOTOGRAPHS:
-                raise ValueError(
-                    f"expected another name than {name!r}, which photographs have"
-                )
+            _check_part_name(name)
             for key, other in (("around", part.around), ("drawn_as", part.drawn_as)):
                 if other is not None and other not in earlier:
                     raise ValueError(
@@ -155,19 +162,30 @@ class Recipe(_Described):
                 raise errors.UnknownNameError(
                     "part", name, self.parts, "It stands under `quick` in the recipe."
                 )
-        parts = dict[str, Part]()
-        for name, part in self.parts.items():
-            if name in self.quick.without:
-                continue
-            changes = self.quick.parts.get(name, {})
-            part_settings = settings.merge_mappings(part.settings, changes)
-            parts[name] = part.model_copy(update={"settings": part_settings})
-        return self.model_copy(
-            update={
-                "settings": settings.merge_mappings(self.settings, self.quick.settings),
-                "parts": parts,
-            }
+        parts = {
+            name: self._change_part(name)
+            for name in self.parts
+            if name not in self.quick.without
+        }
+        quick_settings = settings.merge_mappings(self.settings, self.quick.settings)
+        return self.model_copy(update={"settings": quick_settings, "parts": parts})
+
+    def _change_part(self, name: str) -> Part:
+        """Return a part with the changes that `quick` has for its settings."""
+        part = self.parts[name]
+        changes = self.quick.parts.get(name, {})
+        part_settings = settings.merge_mappings(part.settings, changes)
+        return part.model_copy(update={"settings": part_settings})
+
+
+def _check_part_name(name: str) -> None:
+    """Raise an error if a part cannot have this name."""
+    if not re.fullmatch(r"[a-z0-9][a-z0-9-]{0,39}", name):
+        raise ValueError(
+            f"expected names of small letters, digits and hyphens, got {name[:40]!r}"
         )
+    if name == PHOTOGRAPHS:
+        raise ValueError(f"expected another name than {name!r}, which photographs have")
 
 
 def list_recipes() -> tuple[str, ...]:
@@ -292,36 +310,48 @@ def plan_runs(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
     """
     recipe = apply_command_settings(recipe, config)
     runs = list[PlannedRun]()
-    for name, part in recipe.parts.items():
-        axes = _list_axes(recipe, part)
-        for index, values in enumerate(product(*axes.values())):
-            value_of_setting = dict(zip(axes, values, strict=True))
-            run_config = _make_run_config(recipe, name, index, value_of_setting, config)
-            # the object, and what else differs between the runs of the part
-            words = [
-                value
-                for axis, value in value_of_setting.items()
-                if axis == "object" or len(axes[axis]) > 1
-            ]
-            suffix = f"{index:02d}-{make_directory_name(words)}"
-            # `around` of a part is the name of a part; that of a run is a directory.
-            search_directory = None
-            if part.around is not None:
-                search_directory = f"{part.around}-{suffix}"
-            runs.append(
-                PlannedRun(
-                    name=f"{name}-{suffix}",
-                    part_name=name,
-                    config=run_config,
-                    search_run_name=search_directory,
-                )
-            )
+    for name in recipe.parts:
+        runs += _plan_runs_of_part(recipe, name, config)
     if len(runs) > MAX_RUNS:
         raise InputError(
             f"{config.recipe}: expected at most {MAX_RUNS} runs, got "
             f"{len(runs)}; name fewer objects"
         )
     return runs
+
+
+def _plan_runs_of_part(
+    recipe: Recipe, name: str, config: RecipeConfig
+) -> list[PlannedRun]:
+    """Plan the runs of one part, by its name."""
+    part = recipe.parts[name]
+    axes = _list_axes(recipe, part)
+    runs = []
+    for index, values in enumerate(product(*axes.values())):
+        value_of_setting = dict(zip(axes, values, strict=True))
+        run_config = _make_run_config(recipe, name, index, value_of_setting, config)
+        suffix = f"{index:02d}-{_name_combination(axes, value_of_setting)}"
+        # `around` of a part is the name of a part; that of a run is a directory.
+        search_directory = None if part.around is None else f"{part.around}-{suffix}"
+        runs.append(PlannedRun(f"{name}-{suffix}", name, run_config, search_directory))
+    return runs
+
+
+def _name_combination(
+    axes: Mapping[str, Sequence[str]], value_of_setting: Mapping[str, str]
+) -> str:
+    """Name a run after its object, and what else differs between runs of its part.
+
+    Args:
+        axes: all values of each setting that is combined.
+        value_of_setting: the values of the run.
+    """
+    words = [
+        value
+        for axis, value in value_of_setting.items()
+        if axis == "object" or len(axes[axis]) > 1
+    ]
+    return make_directory_name(words)
 
 
 def _list_axes(recipe: Recipe, part: Part) -> dict[str, list[str]]:
@@ -372,14 +402,25 @@ def _make_run_config(
         **value_of_setting,
         "seed": seeds.derive_seed(config.seed, seed_name),
     }
+    _apply_common_settings(run_settings, config, value_of_setting["object"])
+    return _make_part_config(part, run_settings, f"{config.recipe}: parts: {name}")
+
+
+def _apply_common_settings(
+    run_settings: Settings, config: RecipeConfig, object_name: str
+) -> None:
+    """Add the threads and the label of the command to the settings of a run."""
     if config.deterministic:
         run_settings["deterministic"] = True
     else:
         run_settings["threads"] = config.threads
-    label = config.find_label(value_of_setting["object"])
+    label = config.find_label(object_name)
     if label is not None:
         run_settings["label"] = label
-    where = f"{config.recipe}: parts: {name}"
+
+
+def _make_part_config(part: Part, run_settings: Settings, where: str) -> SceneConfig:
+    """Make the settings of a part's command; errors begin with `where`."""
     config_type = CONFIGS[part.command]
     try:
         return config_type(**run_settings)
@@ -433,22 +474,8 @@ def apply_command_settings(recipe: Recipe, config: RecipeConfig) -> Recipe:
     """
     if config.quick:
         recipe = recipe.apply_quick()
-    names = (
-        "object",
-        "environment",
-        "model",
-        "labels",
-        "prompt",
-        "value_range",
-        "task",
-        "up",
-        "facing",
-        "size",
-        "unit",
-        "resolution",
-    )
     merged: Settings = dict(recipe.settings)
-    for name in names:
+    for name in REPLACED_SETTINGS:
         value = getattr(config, name)
         if value is not None:
             merged[name] = value

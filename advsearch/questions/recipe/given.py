@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Any
 
@@ -26,6 +27,8 @@ from advsearch.questions.recipe.rates import (
 MAX_LETTERS = 85
 # minimum number of characters of a shortened name
 MIN_LETTERS = 4
+# height of a stacked bar as a fraction of the distance between bars
+STACKED_BAR_HEIGHT = 0.72
 
 # how often a prediction is given, and how many of these predictions are right
 PredictionCount = tuple[ClusteredFraction, int]
@@ -47,42 +50,65 @@ def make_predictions_figure(rows: Rows, options: PredictionsOptions) -> FigureCo
         rows: rows of the parts that the figure shows.
         options: the column, and the number of predictions for each of its values.
     """
-    groups = dict[str, list[PredictionCount]]()
-    for value, group_rows in rates.split_rows(rows, options.by).items():
-        groups[value] = []
-        ranking = rates.rank_predictions(group_rows[rates.PREDICTION_COLUMN])
-        for label, _ in ranking[: options.most]:
-            has_label = group_rows[rates.PREDICTION_COLUMN] == label
-            tally = ClusteredFraction.from_rows(label, group_rows, has_label)
-            rows_with_label = group_rows[has_label]
-            n_right = int(rows_with_label["correct"].sum())
-            groups[value].append((tally, n_right))
-
-    def draw(figure: Any) -> None:
-        """Draw a stacked bar for each value of the column."""
-        axes = figure.subplots()
-        for position, counts in enumerate(groups.values()):
-            _draw_stacked_bar(axes, position, counts)
-        axes.set_yticks(range(len(groups)), list(groups))
-        axes.invert_yaxis()
-        # `_draw_stacked_bar` chooses the colors.
-        axes.set(
-            xlabel="share of predictions; blue: mostly right, red: mostly wrong, "
-            "grey: others",
-            xlim=(0.0, 1.0),
-        )
-
-    table = list[list[rates.Cell]]()
-    for value, counts in groups.items():
-        for tally, n_right in counts:
-            table.append([value, tally.name, *tally.table_cells, n_right])
+    groups = {
+        value: _count_frequent(group_rows, options.most)
+        for value, group_rows in rates.split_rows(rows, options.by).items()
+    }
     return FigureContent(
         title=f"Most frequent predictions by {options.by}",
         text=_describe_predictions(groups, rates.pluralize_column(options.by)),
         columns=[options.by, "prediction", "given in", *rates.FRACTION_HEADS, "right"],
-        rows=table,
-        draw=draw,
+        rows=_tabulate_predictions(groups),
+        draw=lambda figure: _draw_predictions(figure, groups),
         size=(6.4, 1.2 + 0.3 * len(groups)),
+    )
+
+
+def _tabulate_predictions(
+    groups: Mapping[str, Sequence[PredictionCount]],
+) -> list[list[rates.Cell]]:
+    """Return a table row of each group's frequent predictions, with how many are right.
+
+    `groups` has the predictions of each group with their counts.
+    """
+    return [
+        [value, tally.name, *tally.table_cells, n_right]
+        for value, counts in groups.items()
+        for tally, n_right in counts
+    ]
+
+
+def _count_frequent(rows: Rows, most: int) -> list[PredictionCount]:
+    """Count the most frequent predictions of some rows, and how many are right.
+
+    Args:
+        rows: rows of one group.
+        most: maximum number of predictions.
+    """
+    counts = list[PredictionCount]()
+    ranking = rates.rank_predictions(rows[rates.PREDICTION_COLUMN])
+    for label, _ in ranking[:most]:
+        has_label = rows[rates.PREDICTION_COLUMN] == label
+        tally = ClusteredFraction.from_rows(label, rows, has_label)
+        n_right = int(rows[has_label]["correct"].sum())
+        counts.append((tally, n_right))
+    return counts
+
+
+def _draw_predictions(
+    figure: Any, groups: Mapping[str, Sequence[PredictionCount]]
+) -> None:
+    """Draw a stacked bar of predictions for each value of the column."""
+    axes = figure.subplots()
+    for position, counts in enumerate(groups.values()):
+        _draw_stacked_bar(axes, position, counts)
+    axes.set_yticks(range(len(groups)), list(groups))
+    axes.invert_yaxis()
+    # `_draw_stacked_bar` chooses the colors.
+    axes.set(
+        xlabel="share of predictions; blue: mostly right, red: mostly wrong, "
+        "grey: others",
+        xlim=(0.0, 1.0),
     )
 
 
@@ -98,22 +124,33 @@ def _describe_predictions(
             fraction and how often it is right.
         things: plural of what the groups are.
     """
-    sentences = list[str]()
-    for value, counts in groups.items():
-        tally, n_right = counts[0]
-        is_mostly_right = 2 * n_right >= tally.n_counted
-        if not is_mostly_right:
-            sentences.append(
-                f"For {value} it is {tally.name}, {tally.describe('given')} and right "
-                "in "
-                f"{n_right} of these."
-            )
+    # the first prediction of each group is the most frequent one
+    sentences = [
+        _describe_mostly_wrong(value, counts[0])
+        for value, counts in groups.items()
+        if not _is_mostly_right(counts[0])
+    ]
     n_mostly_right = len(groups) - len(sentences)
     overview = (
         f"For {n_mostly_right} of {len(groups)} {things} the most frequent prediction "
         "is mostly a right one."
     )
     return [overview, *sentences]
+
+
+def _describe_mostly_wrong(group: str, count: PredictionCount) -> str:
+    """Describe how often a group's most frequent prediction is given, and is right."""
+    tally, n_right = count
+    return (
+        f"For {group} it is {tally.name}, {tally.describe('given')} and right in "
+        f"{n_right} of these."
+    )
+
+
+def _is_mostly_right(count: PredictionCount) -> bool:
+    """Return whether a prediction is right in at least half of its cases."""
+    tally, n_right = count
+    return 2 * n_right >= tally.n_counted
 
 
 def _draw_stacked_bar(
@@ -129,37 +166,31 @@ def _draw_stacked_bar(
         counts: fraction of each prediction, and how often it is right.
     """
     left = 0.0
-    for tally, n_right in counts:
-        share = tally.fraction or 0.0
-        is_mostly_right = 2 * n_right >= tally.n_counted
-        color = figures.BLUE if is_mostly_right else figures.RED
-        axes.barh(
-            position,
-            share,
-            left=left,
-            color=color,
-            alpha=0.5,
-            height=0.72,
-            edgecolor="white",
-        )
-        axes.text(
-            left + share / 2,
-            position,
-            shorten_to_fit(tally.name, share),
-            ha="center",
-            va="center",
-            fontsize=7,
-        )
-        left += share
+    for count in counts:
+        left += _draw_share(axes, position, left, count)
     other_share = max(1.0 - left, 0.0)  # not below 0 by rounding
-    axes.barh(
-        position,
-        other_share,
-        left=left,
-        color=figures.GREY,
-        alpha=0.15,
-        height=0.72,
-    )
+    style = {"color": figures.GREY, "alpha": 0.15, "height": STACKED_BAR_HEIGHT}
+    axes.barh(position, other_share, left=left, **style)
+
+
+def _draw_share(axes: Any, position: int, left: float, count: PredictionCount) -> float:
+    """Draw one prediction as a part of a stacked bar, and return its share of the bar.
+
+    Args:
+        axes: axes of matplotlib.
+        position: position of the bar on the vertical axis.
+        left: end of the part before it.
+        count: fraction of the prediction, and how often it is right.
+    """
+    tally, _ = count
+    share = tally.fraction or 0.0
+    color = figures.BLUE if _is_mostly_right(count) else figures.RED
+    style = {"alpha": 0.5, "height": STACKED_BAR_HEIGHT, "edgecolor": "white"}
+    axes.barh(position, share, left=left, color=color, **style)
+    center = left + share / 2
+    name = shorten_to_fit(tally.name, share)
+    axes.text(center, position, name, ha="center", va="center", fontsize=7)
+    return share
 
 
 def shorten_to_fit(name: str, fraction: float) -> str:
@@ -185,6 +216,10 @@ SEED = 0
 RESAMPLES = 2000
 # minimum number of pairs of object and texture: two of each
 MIN_PAIRS = 4
+TOO_FEW_PAIRS = (
+    "Whether the predictions go more by shape or by texture is not said: that takes at "
+    f"least two objects and two textures, {MIN_PAIRS} pairs in all."
+)
 
 
 class CuesOptions(Options):
@@ -207,37 +242,76 @@ def make_cues_figure(rows: Rows, options: CuesOptions) -> FigureContent:
         rows: rows with object and texture.
         options: the columns of both, and the classes that name each texture.
     """
-    # The keys are names of textures.
-    names_texture = dict[str, Any]()  # whether each prediction (n,) names the texture
-    by_shape = dict[str, ClusteredFraction]()  # predictions of the object: right ones
-    by_texture = dict[str, ClusteredFraction]()  # predictions of the texture
-    for texture, texture_rows in rates.split_rows(rows, options.texture).items():
-        classes = options.classes.get(texture, ())
-        names_texture[texture] = _names_class(
-            texture_rows[rates.PREDICTION_COLUMN], classes
+    rows_of_texture = rates.split_rows(rows, options.texture)
+    # for each texture, whether each of its predictions (n,) names it
+    names_texture = {
+        texture: _names_class(
+            texture_rows[rates.PREDICTION_COLUMN], options.classes.get(texture, ())
         )
-        by_shape[texture] = ClusteredFraction.from_rows(texture, texture_rows)
-        by_texture[texture] = ClusteredFraction.from_rows(
-            texture, texture_rows, names_texture[texture]
-        )
+        for texture, texture_rows in rows_of_texture.items()
+    }
+    by_shape = _count_named(rows_of_texture)  # a right prediction names the object
+    by_texture = _count_named(rows_of_texture, names_texture)
+    return FigureContent(
+        title="Predictions by shape and by texture",
+        text=_describe_cues(rows, names_texture, by_shape, options),
+        columns=[options.texture, "the object", *rates.FRACTION_HEADS, "the texture"],
+        rows=_tabulate_cues(by_shape, by_texture),
+        draw=lambda figure: _draw_cues(figure, by_shape, by_texture),
+        size=(6.0, 1.7 + 0.27 * len(by_shape)),
+    )
 
+
+def _count_named(
+    rows_of_texture: Mapping[str, Rows], flags: Mapping[str, Any] | None = None
+) -> dict[str, ClusteredFraction]:
+    """Count for each texture how many of its rows are right, or have a flag.
+
+    Args:
+        rows_of_texture: the rows of each texture.
+        flags: for each texture, whether each of its rows (n,) is counted; None counts
+            the right ones.
+    """
+    return {
+        texture: ClusteredFraction.from_rows(
+            texture, texture_rows, None if flags is None else flags[texture]
+        )
+        for texture, texture_rows in rows_of_texture.items()
+    }
+
+
+def _describe_cues(
+    rows: Rows,
+    names_texture: Mapping[str, Any],
+    by_shape: Mapping[str, ClusteredFraction],
+    options: CuesOptions,
+) -> list[str]:
+    """Describe how far the predictions depend on the shape, and how far on the texture.
+
+    Args:
+        rows: rows with object and texture.
+        names_texture: for each texture, whether the prediction of each of its rows
+            (n,) names it.
+        by_shape: for each texture, how often the prediction names the object.
+        options: options of the figure.
+    """
     text = _describe_named(rows, names_texture, options)
     text.append(_compare_cues(count_predicted(rows, options)))
     text += rates.describe_extremes(
         list(by_shape.values()), "The hardest texture", "the easiest", "textures"
     )
-    table: list[list[rates.Cell]] = [
+    return text
+
+
+def _tabulate_cues(
+    by_shape: Mapping[str, ClusteredFraction],
+    by_texture: Mapping[str, ClusteredFraction],
+) -> list[list[rates.Cell]]:
+    """Return a table row of each texture: how often the object and it are named."""
+    return [
         [name, *by_shape[name].table_cells, by_texture[name].n_counted]
         for name in by_shape
     ]
-    return FigureContent(
-        title="Predictions by shape and by texture",
-        text=text,
-        columns=[options.texture, "the object", *rates.FRACTION_HEADS, "the texture"],
-        rows=table,
-        draw=lambda figure: _draw_cues(figure, by_shape, by_texture),
-        size=(6.0, 1.7 + 0.27 * len(by_shape)),
-    )
 
 
 def _describe_named(
@@ -258,15 +332,31 @@ def _describe_named(
     ]
     with_classes = [name for name in names_texture if options.classes.get(name)]
     if with_classes:
-        # The index of the flags is that of their rows in `rows`, where it is unique.
-        flags = pd.concat([names_texture[name] for name in with_classes])
-        total = ClusteredFraction.from_rows("", rows.loc[flags.index], flags)
-        text.append(
-            f"The prediction names the texture ({', '.join(with_classes)}): "
-            f"{total.describe('so')}."
-        )
-        if not total.fraction:
-            text.append("A model that has no class for a texture cannot name it.")
+        flags = [names_texture[name] for name in with_classes]
+        text += _describe_named_textures(rows, with_classes, flags)
+    return text
+
+
+def _describe_named_textures(
+    rows: Rows, textures: Sequence[str], flags: Sequence[Any]
+) -> list[str]:
+    """Describe how often predictions name the texture, if it has a class.
+
+    Args:
+        rows: rows with object and texture.
+        textures: names of the textures that have classes.
+        flags: for each of them, whether the prediction of each of its rows (n,) names
+            it.
+    """
+    # The index of the flags is that of their rows in `rows`, where it is unique.
+    all_flags = pd.concat(flags)
+    total = ClusteredFraction.from_rows("", rows.loc[all_flags.index], all_flags)
+    text = [
+        f"The prediction names the texture ({', '.join(textures)}): "
+        f"{total.describe('so')}."
+    ]
+    if not total.fraction:
+        text.append("A model that has no class for a texture cannot name it.")
     return text
 
 
@@ -297,32 +387,45 @@ def _draw_cues(
     """
     axes = figure.subplots()
     ordered = sorted(by_shape, key=lambda name: by_shape[name].fraction or 0.0)
-    shape_shares = [by_shape[name].fraction or 0.0 for name in ordered]
-    texture_shares = [by_texture[name].fraction or 0.0 for name in ordered]
-    style = {"alpha": 0.55, "height": 0.66}
-    axes.barh(ordered, shape_shares, color=figures.BLUE, label="the object", **style)
-    axes.barh(
-        ordered,
-        texture_shares,
-        left=shape_shares,
-        color=figures.RED,
-        label="the texture",
-        **style,
-    )
-    # The intervals are those of the bars of the object, which begin at 0.
-    for position, name in enumerate(ordered):
-        axes.plot(
-            by_shape[name].interval(),
-            [position, position],
-            color="#1c1d20",
-            linewidth=1.2,
-        )
-    axes.set(
-        xlabel="share of predictions; line: 95 % interval of the object's",
-        xlim=(0.0, 1.0),
-    )
+    shape_tallies = [by_shape[name] for name in ordered]
+    _draw_named(axes, ordered, shape_tallies, [by_texture[name] for name in ordered])
+    _draw_intervals(axes, shape_tallies)
+    x_label = "share of predictions; line: 95 % interval of the object's"
+    axes.set(xlabel=x_label, xlim=(0.0, 1.0))
     axes.grid(True, axis="x")
     figure.legend(loc="outside lower center", ncols=2, title="the prediction names")
+
+
+def _draw_named(
+    axes: Any,
+    textures: Sequence[str],
+    shape_tallies: Sequence[ClusteredFraction],
+    texture_tallies: Sequence[ClusteredFraction],
+) -> None:
+    """Draw a stacked bar of both fractions for each texture.
+
+    Args:
+        axes: axes of matplotlib.
+        textures: names of the textures.
+        shape_tallies: for each, how often the prediction names the object.
+        texture_tallies: for each, how often the prediction names the texture.
+    """
+    shape_shares = [tally.fraction or 0.0 for tally in shape_tallies]
+    texture_shares = [tally.fraction or 0.0 for tally in texture_tallies]
+    style: dict[str, Any] = {"alpha": 0.55, "height": 0.66}
+    axes.barh(textures, shape_shares, color=figures.BLUE, label="the object", **style)
+    # The bars of the textures begin where those of the objects end.
+    style |= {"left": shape_shares, "color": figures.RED}
+    axes.barh(textures, texture_shares, label="the texture", **style)
+
+
+def _draw_intervals(axes: Any, tallies: Sequence[ClusteredFraction]) -> None:
+    """Draw the interval of each fraction as a line on its bar."""
+    # The intervals are those of the bars of the object, which begin at 0.
+    for position, tally in enumerate(tallies):
+        axes.plot(
+            tally.interval(), [position, position], color="#1c1d20", linewidth=1.2
+        )
 
 
 def count_predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, int]]:
@@ -343,16 +446,7 @@ def count_predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, in
         shape foretells, and those that the texture foretells.
     """
     generator = random.Random(SEED)
-    groups = rows.groupby(
-        [
-            rates.get_column(rows, options.shape),
-            rates.get_column(rows, options.texture),
-        ],
-        sort=False,
-    )
-    labels_of_pair = {
-        pair: list(pair_rows[rates.PREDICTION_COLUMN]) for pair, pair_rows in groups
-    }
+    labels_of_pair = _group_labels(rows, options)
     counts = list[tuple[int, int, int]]()
     for (shape, texture), labels in labels_of_pair.items():
         same_shape, same_texture = _collect_labels(labels_of_pair, shape, texture)
@@ -365,6 +459,16 @@ def count_predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, in
                 (len(labels), labels.count(by_shape), labels.count(by_texture))
             )
     return counts
+
+
+def _group_labels(rows: Rows, options: CuesOptions) -> dict[Any, list[str]]:
+    """Return the predictions by (object, texture)."""
+    shapes = rates.get_column(rows, options.shape)
+    textures = rates.get_column(rows, options.texture)
+    groups = rows.groupby([shapes, textures], sort=False)
+    return {
+        pair: list(pair_rows[rates.PREDICTION_COLUMN]) for pair, pair_rows in groups
+    }
 
 
 def _collect_labels(
@@ -408,25 +512,8 @@ def _compare_cues(pairs: Sequence[tuple[int, int, int]]) -> str:
         pairs: counts of each pair of object and texture, from `count_predicted`.
     """
     if len(pairs) < MIN_PAIRS:
-        return (
-            "Whether the predictions go more by shape or by texture is not said: that "
-            "takes at least two objects and "
-            f"two textures, {MIN_PAIRS} pairs in all."
-        )
-    generator = random.Random(SEED)
-    resampled = sorted(
-        _compute_shape_advantage(generator.choices(pairs, k=len(pairs)))
-        for _ in range(RESAMPLES)
-    )
-    # 2.5 % of the values at each end are outside of the interval.
-    n_outside = round(RESAMPLES * 0.025)
-    lower = resampled[n_outside]
-    upper = resampled[-1 - n_outside]
-    verdict = "no difference is shown"
-    if lower > 0.0:
-        verdict = "the model goes more by shape than by texture"
-    elif upper < 0.0:
-        verdict = "the model goes more by texture than by shape"
+        return TOO_FEW_PAIRS
+    lower, upper = _bootstrap_shape_advantage(pairs)
     total, n_by_shape, n_by_texture = map(sum, zip(*pairs, strict=True))
     return (
         "The most frequent prediction about the same object with other textures is "
@@ -435,8 +522,31 @@ def _compare_cues(pairs: Sequence[tuple[int, int, int]]) -> str:
         f"{wording.percent(n_by_texture / total)}: "
         f"{_compute_shape_advantage(pairs):.0f} points more by shape "
         f"(95 % interval {lower:.0f} to {upper:.0f}, over pairs of object and "
-        f"texture): {verdict}."
+        f"texture): {_judge_shape_advantage(lower, upper)}."
     )
+
+
+def _bootstrap_shape_advantage(
+    pairs: Sequence[tuple[int, int, int]],
+) -> tuple[float, float]:
+    """Return the 95 % interval of how much better the shape predicts, in points."""
+    generator = random.Random(SEED)
+    resampled = sorted(
+        _compute_shape_advantage(generator.choices(pairs, k=len(pairs)))
+        for _ in range(RESAMPLES)
+    )
+    # 2.5 % of the values at each end are outside of the interval.
+    n_outside = round(RESAMPLES * 0.025)
+    return resampled[n_outside], resampled[-1 - n_outside]
+
+
+def _judge_shape_advantage(lower: float, upper: float) -> str:
+    """Describe which cue the model uses more, by an interval of the difference."""
+    if lower > 0.0:
+        return "the model goes more by shape than by texture"
+    if upper < 0.0:
+        return "the model goes more by texture than by shape"
+    return "no difference is shown"
 
 
 def _compute_shape_advantage(pairs: Sequence[tuple[int, int, int]]) -> float:
@@ -493,34 +603,68 @@ def make_ternary_figure(rows: Rows, options: TernaryOptions) -> FigureContent:
     corners_of_triangle = list_triangles(options.side)
     in_triangle = _split_by_triangle(options, mixtures, list(corners_of_triangle))
 
-    ranking = rates.rank_predictions(rows[rates.PREDICTION_COLUMN])
+    all_predictions = rates.rank_predictions(rows[rates.PREDICTION_COLUMN])
     margins = _group_margins(rows, names, main_ingredient)
-    has_single_prediction = len(ranking) == 1
-    # The interval of a mean needs two values for each ingredient.
-    by_margin = has_single_prediction and min(map(len, margins.values())) >= 2
-    ranking = ranking[: options.most]
-    if by_margin:
-        # The ranking has a single label, with its count.
-        text, heads, table = _describe_margins(ranking[0][0], margins)
-    else:
-        text, heads, table = _describe_ingredients(
-            rows, ranking, names, main_ingredient
-        )
-    panels = _make_panels(rows, ranking, by_margin, in_triangle)
-    text += _describe_empty(in_triangle)
-
-    def draw(figure: Any) -> None:
-        corners = list(corners_of_triangle.values())
-        _draw_panels(figure, panels, corners, names, by_margin, options)
-
+    by_margin = _shows_margins(all_predictions, margins)
+    ranking = all_predictions[: options.most]
+    text, heads, table = _describe_mixtures(
+        rows, ranking, names, main_ingredient, margins if by_margin else None
+    )
+    diagrams = _TernaryDiagrams(
+        panels=_make_panels(rows, ranking, by_margin, in_triangle),
+        corners=list(corners_of_triangle.values()),
+        names=names,
+        by_margin=by_margin,
+        normalised=options.normalised,
+    )
     return FigureContent(
         title=f"Predictions over {', '.join(names)}",
-        text=text,
+        text=text + _describe_empty(in_triangle),
         columns=heads,
         rows=table,
-        draw=draw,
-        size=(max(2.4 * len(panels), 4.8), 3.5),
+        draw=diagrams.draw,
+        size=(max(2.4 * len(diagrams.panels), 4.8), 3.5),
     )
+
+
+def _describe_mixtures(
+    rows: Rows,
+    ranking: Sequence[tuple[str, int]],
+    names: Sequence[str],
+    main_ingredient: npt.NDArray[np.intp],
+    margins: Mapping[str, Float64Array] | None,
+) -> tuple[list[str], list[str], list[list[rates.Cell]]]:
+    """Describe predictions, or the margins of a single one, by the main ingredient.
+
+    Args:
+        rows: rows of one mixture each.
+        ranking: the predictions with their counts, the most frequent first.
+        names: names of the ingredients.
+        main_ingredient: (n,) index of the largest ingredient in each row.
+        margins: margins by the main ingredient; None to describe predictions.
+
+    Returns:
+        Sentences, and the heads and rows of a table.
+    """
+    if margins is None:
+        return _describe_ingredients(rows, ranking, names, main_ingredient)
+    # The ranking has a single label, with its count.
+    label, _ = ranking[0]
+    return _describe_margins(label, margins)
+
+
+def _shows_margins(
+    ranking: Sequence[tuple[str, int]], margins: Mapping[str, Float64Array]
+) -> bool:
+    """Return whether a figure shows margins, since all predictions are the same.
+
+    Args:
+        ranking: the predictions with their counts.
+        margins: the known margins of the mixtures, by their main ingredient.
+    """
+    has_single_prediction = len(ranking) == 1
+    # The interval of a mean needs two values for each ingredient.
+    return has_single_prediction and min(map(len, margins.values())) >= 2
 
 
 def _split_by_triangle(
@@ -642,17 +786,20 @@ def _describe_margins(
         Sentences, and the heads and rows of a table.
     """
     text = [SINGLE_PREDICTION.format(label), _compare_margins(margins)]
-    heads = [
-        "where most is",
-        "pictures",
-        "mean lead of the right label",
-        "standard error",
-    ]
     table: list[list[rates.Cell]] = [
         [name, len(values), float(values.mean()), _compute_standard_error(values)]
         for name, values in margins.items()
     ]
-    return text, heads, table
+    return text, MARGIN_HEADS, table
+
+
+MARGIN_HEADS = [
+    "where most is",
+    "pictures",
+    "mean lead of the right label",
+    "standard error",
+]
+"""Heads of the table of margins by the main ingredient."""
 
 
 def _describe_ingredients(
@@ -677,75 +824,118 @@ def _describe_ingredients(
     heads = ["prediction", "where most is", "given in", *rates.FRACTION_HEADS]
     for label, n_predictions in ranking:
         is_label = (rows[rates.PREDICTION_COLUMN] == label).to_numpy()
-        # for each ingredient, how often the label is predicted if it is the largest
-        tallies = []
-        for index, name in enumerate(names):
-            is_main = main_ingredient == index
-            tallies.append(
-                ClusteredFraction.from_rows(name, rows[is_main], is_label[is_main])
-            )
+        tallies = _count_by_ingredient(rows, is_label, names, main_ingredient)
         share = wording.percent(n_predictions / len(rows))
         # A sentence begins: "mug, 12 % of all predictions, is rarest where ...".
-        beginning = f"{label}, {share} of all predictions, is"
-        known_fractions = {tally.fraction for tally in tallies if tally.total}
-        if len(known_fractions) == 1:
-            text.append(
-                f"{beginning} given as often whatever most of the mixture is: no "
-                "difference is shown."
-            )
-        else:
-            text += rates.describe_extremes(
-                tallies,
-                lowest_prefix=f"{beginning} rarest where most of the mixture",
-                highest_prefix="most frequent where most of it",
-                things="ingredients",
-                verb="given",
-            )
+        text += _compare_ingredients(
+            tallies, f"{label}, {share} of all predictions, is"
+        )
         table += [[label, tally.name, *tally.table_cells] for tally in tallies]
     return text, heads, table
 
 
-def _draw_panels(
-    figure: Any,
-    panels: Mapping[str, Sequence[float | None]],
-    corners: Sequence[Sequence[Mixture]],
+def _count_by_ingredient(
+    rows: Rows,
+    is_label: npt.NDArray[np.bool_],
     names: Sequence[str],
-    by_margin: bool,
-    options: TernaryOptions,
-) -> None:
-    """Draw a ternary diagram for each prediction, with one or several color bars.
+    main_ingredient: npt.NDArray[np.intp],
+) -> list[ClusteredFraction]:
+    """Count for each ingredient how often a label is predicted if it is the largest.
+
+    Args:
+        rows: rows of one mixture each.
+        is_label: (n,) whether the prediction of each row is the label.
+        names: names of the ingredients.
+        main_ingredient: (n,) index of the largest ingredient in each row.
+    """
+    tallies = []
+    for index, name in enumerate(names):
+        is_main = main_ingredient == index
+        tallies.append(
+            ClusteredFraction.from_rows(name, rows[is_main], is_label[is_main])
+        )
+    return tallies
+
+
+def _compare_ingredients(
+    tallies: Sequence[ClusteredFraction], beginning: str
+) -> list[str]:
+    """Describe with which main ingredient a label is rarest, and with which it is not.
+
+    Args:
+        tallies: how often it is predicted with each main ingredient.
+        beginning: the first words of the sentence.
+    """
+    known_fractions = {tally.fraction for tally in tallies if tally.total}
+    if len(known_fractions) == 1:
+        same = "given as often whatever most of the mixture is: no difference is shown"
+        return [f"{beginning} {same}."]
+    return rates.describe_extremes(
+        tallies,
+        lowest_prefix=f"{beginning} rarest where most of the mixture",
+        highest_prefix="most frequent where most of it",
+        things="ingredients",
+        verb="given",
+    )
+
+
+@dataclass(frozen=True)
+class _TernaryDiagrams:
+    """Ternary diagrams of several predictions, with one or several color bars.
 
     All diagrams have the same colors and share a color bar, unless they are normalised.
 
-    Args:
-        figure: figure of matplotlib.
+    Attributes:
         panels: the value of each triangle, by prediction.
         corners: mixtures at the corners of the triangles.
         names: names of the ingredients.
         by_margin: whether values are margins, not fractions.
-        options: options of the figure; if `normalised`, each diagram has its own colors
-            and its own color bar.
+        normalised: whether each diagram has its own colors and its own color bar.
     """
-    all_axes = figure.subplots(1, len(panels), squeeze=False)[0]
-    for axes, (prediction, values) in zip(all_axes, panels.items(), strict=True):
-        triangles = _draw_panel(axes, prediction, values, corners, names)
+
+    panels: Mapping[str, Sequence[float | None]]
+    corners: Sequence[Sequence[Mixture]]
+    names: Sequence[str]
+    by_margin: bool
+    normalised: bool
+
+    def draw(self, figure: Any) -> None:
+        """Draw the diagrams in a row on a figure of matplotlib."""
+        all_axes = figure.subplots(1, len(self.panels), squeeze=False)[0]
+        for axes, (label, values) in zip(all_axes, self.panels.items(), strict=True):
+            triangles = self._draw_diagram(axes, label, values)
+            if self.normalised:
+                figure.colorbar(
+                    triangles, ax=axes, shrink=0.7, location="bottom", label=label
+                )
+        if not self.normalised:
+            # All diagrams have the colors of the last one: fractions have the range 0
+            # to 1, and of margins there is only one diagram.
+            self._draw_color_bar(figure, triangles, list(all_axes))
+
+    def _draw_diagram(
+        self, axes: Any, label: str, values: Sequence[float | None]
+    ) -> Any:
+        """Draw the diagram of a prediction, and return its colored triangles."""
+        triangles = _draw_panel(axes, label, values, self.corners, self.names)
         known = [value for value in values if value is not None]
-        triangles.set_clim(
-            *_choose_color_range(known, by_margin, normalised=options.normalised)
+        color_range = _choose_color_range(
+            known, self.by_margin, normalised=self.normalised
         )
-        if options.normalised:
-            figure.colorbar(
-                triangles, ax=axes, shrink=0.7, location="bottom", label=prediction
-            )
-    if not options.normalised:
-        # All diagrams have the colors of the last one: fractions have the range 0 to 1,
-        # and of margins there is only one diagram.
+        triangles.set_clim(*color_range)
+        return triangles
+
+    def _draw_color_bar(
+        self, figure: Any, triangles: Any, all_axes: Sequence[Any]
+    ) -> None:
+        """Draw the color bar that all diagrams share."""
+        label = "lead of the right label" if self.by_margin else "share of predictions"
         figure.colorbar(
             triangles,
-            ax=list(all_axes),
+            ax=all_axes,
             shrink=0.7 / len(all_axes),
             location="bottom",
-            label="lead of the right label" if by_margin else "share of predictions",
+            label=label,
         )
 
 
@@ -818,25 +1008,38 @@ def _compare_margins(margins: Mapping[str, Float64Array]) -> str:
     """
     smallest = min(margins, key=lambda name: margins[name].mean())
     largest = max(margins, key=lambda name: margins[name].mean())
-    descriptions = []
-    for name in (smallest, largest):
-        # not widened: the interval of this mean alone
-        lower, upper = _compute_mean_interval(margins[name])
-        descriptions.append(
-            f"{name}: {margins[name].mean():.3g} "
-            f"(95 % interval {lower:.3g} to {upper:.3g}, {len(margins[name])} pictures)"
-        )
-    widened = f"their intervals, widened for having been chosen among {len(margins)},"
-    verdict = f"No difference is shown: {widened} overlap"
-    n_compared = len(margins)
-    _, upper_of_smallest = _compute_mean_interval(margins[smallest], n_compared)
-    lower_of_largest, _ = _compute_mean_interval(margins[largest], n_compared)
-    if upper_of_smallest < lower_of_largest:
-        verdict = f"The difference is shown: {widened} do not overlap"
+    least = _describe_mean_margin(smallest, margins[smallest])
+    most = _describe_mean_margin(largest, margins[largest])
+    verdict = _judge_margins(margins[smallest], margins[largest], len(margins))
     # "It" is the right label, which `_describe_margins` names in the sentence before.
     return (
-        f"It leads least where most of the mixture is {descriptions[0]}; most where "
-        f"most of it is {descriptions[1]}. {verdict}."
+        f"It leads least where most of the mixture is {least}; most where "
+        f"most of it is {most}. {verdict}."
+    )
+
+
+def _judge_margins(
+    smallest: Float64Array, largest: Float64Array, n_compared: int
+) -> str:
+    """Describe whether the mean margins (n,) of two ingredients differ.
+
+    Their intervals are widened for a choice among `n_compared` ingredients.
+    """
+    widened = f"their intervals, widened for having been chosen among {n_compared},"
+    _, upper_of_smallest = _compute_mean_interval(smallest, n_compared)
+    lower_of_largest, _ = _compute_mean_interval(largest, n_compared)
+    if upper_of_smallest < lower_of_largest:
+        return f"The difference is shown: {widened} do not overlap"
+    return f"No difference is shown: {widened} overlap"
+
+
+def _describe_mean_margin(ingredient: str, margins: Float64Array) -> str:
+    """Describe the mean margin (n,) of an ingredient with its 95 % interval."""
+    # not widened: the interval of this mean alone
+    lower, upper = _compute_mean_interval(margins)
+    return (
+        f"{ingredient}: {margins.mean():.3g} "
+        f"(95 % interval {lower:.3g} to {upper:.3g}, {len(margins)} pictures)"
     )
 
 
@@ -902,38 +1105,47 @@ def _draw_panel(
         corners: the mixtures at the corners of each triangle.
         names: names of the three ingredients.
     """
-    from matplotlib.collections import PolyCollection  # matplotlib takes half a second
-
-    colored = list[Any]()
-    hatched = list[Any]()
-    for mixtures, value in zip(corners, values, strict=True):
-        points = [_to_plane(mixture) for mixture in mixtures]
-        if value is None:
-            hatched.append(points)
-        else:
-            colored.append(points)
-    triangles = PolyCollection(
-        colored,
-        array=[value for value in values if value is not None],
-        cmap="viridis",
-        edgecolors="face",
-    )
-    axes.add_collection(triangles)
-    axes.add_collection(
-        PolyCollection(
-            hatched,
-            facecolors="#eeeeef",
-            edgecolors="#b9bbc0",
-            hatch="////",
-            linewidth=0,
-        )
-    )
+    triangles = _draw_triangles(axes, values, corners)
     _draw_outline(axes, names)
     axes.set_title(label, fontsize=9, loc="center", pad=14)
     # room for the names of the ingredients around the triangle
     axes.set(xlim=(-0.12, 1.12), ylim=(-0.14, 1.0), aspect="equal")
     axes.axis("off")
     return triangles
+
+
+HATCHED_STYLE: Mapping[str, Any] = {
+    "facecolors": "#eeeeef",
+    "edgecolors": "#b9bbc0",
+    "hatch": "////",
+    "linewidth": 0,
+}
+"""How matplotlib draws triangles without a value."""
+
+
+def _draw_triangles(
+    axes: Any, values: Sequence[float | None], corners: Sequence[Sequence[Mixture]]
+) -> Any:
+    """Draw the triangles of a diagram, and return the colored ones.
+
+    Args:
+        axes: axes of matplotlib.
+        values: value of each triangle; without one it is hatched.
+        corners: the mixtures at the corners of each triangle.
+    """
+    from matplotlib.collections import PolyCollection  # matplotlib takes half a second
+
+    points = [[_to_plane(mixture) for mixture in mixtures] for mixtures in corners]
+    pairs = list(zip(points, values, strict=True))
+    known = [triangle for triangle, value in pairs if value is not None]
+    unknown = [triangle for triangle, value in pairs if value is None]
+    known_values = [value for value in values if value is not None]
+    colored = PolyCollection(
+        known, array=known_values, cmap="viridis", edgecolors="face"
+    )
+    axes.add_collection(colored)
+    axes.add_collection(PolyCollection(unknown, **HATCHED_STYLE))
+    return colored
 
 
 def _draw_outline(axes: Any, names: Sequence[str]) -> None:
@@ -945,17 +1157,22 @@ def _draw_outline(axes: Any, names: Sequence[str]) -> None:
     outline = [_to_plane(mixture) for mixture in pure]
     closed_outline = np.array([*outline, outline[0]])
     axes.plot(*closed_outline.T, color="#1c1d20", linewidth=0.8)
-    for (x, y), name in zip(outline, names, strict=True):
-        is_base = y < 0.1  # a lower corner has y = 0: its name stands below it
-        axes.annotate(
-            name,
-            (x, y),
-            (0, -4 if is_base else 4),
-            textcoords="offset points",
-            ha="center",
-            va="top" if is_base else "bottom",
-            fontsize=8,
-        )
+    for corner, name in zip(outline, names, strict=True):
+        _draw_corner_name(axes, corner, name)
+
+
+def _draw_corner_name(axes: Any, corner: tuple[float, float], name: str) -> None:
+    """Draw the name of an ingredient below a lower corner, or above the upper one."""
+    is_base = corner[1] < 0.1  # a lower corner has y = 0
+    axes.annotate(
+        name,
+        corner,
+        (0, -4 if is_base else 4),
+        textcoords="offset points",
+        ha="center",
+        va="top" if is_base else "bottom",
+        fontsize=8,
+    )
 
 
 def _to_plane(mixture: Mixture) -> tuple[float, float]:

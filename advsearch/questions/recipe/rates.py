@@ -93,31 +93,53 @@ def read_rows(
     """
     rows = list[dict[str, Any]]()
     units_of_measure = dict[str, str]()
-    sweep_units = None  # maps the rows of a sweep to independent units
     with Store.open_to_read(folder) as store:
-        if summary.command == "sweep":
-            is_sampled = summary.sampler is not None
-            sweep_units = workbench.read_units(store, is_sampled=is_sampled)
-        for row in store.rows():
-            if row.kind not in kinds:
-                continue
-            # An image without the object says nothing about its recognition.
-            if row.kind == "sweep" and row.is_out_of_view:
-                continue
-            units_of_measure |= {
-                name: stored["unit"] for name, stored in row.values.items()
-            }
-            # A sweep may also have rows of photographs, each of which is a unit.
-            if summary.command == "attack":
-                independent_unit = f"{seed} {row.step}"
-            elif row.kind == "sweep" and sweep_units is not None:
-                independent_unit = f"{seed} {sweep_units.find_unit(row.step)}"
-            else:
-                independent_unit = f"{folder.name} {row.kind} {row.id}"
+        sweep_units = _read_sweep_units(store, summary)
+        counted = (row for row in store.rows() if _is_counted(row, kinds))
+        for row in counted:
+            for name, stored in row.values.items():
+                units_of_measure[name] = stored["unit"]
+            unit = _name_independent_unit(row, folder, seed, summary, sweep_units)
             values = _read_row_values(row, summary)
-            values |= {"time": row.time, PART_COLUMN: part, "unit": independent_unit}
+            values |= {"time": row.time, PART_COLUMN: part, "unit": unit}
             rows.append({**values, **more})
     return rows, units_of_measure
+
+
+def _is_counted(row: Any, kinds: Sequence[str]) -> bool:
+    """Return whether a stored row is of one of the kinds, and shows the object."""
+    if row.kind not in kinds:
+        return False
+    # An image without the object says nothing about its recognition.
+    return not (row.kind == "sweep" and row.is_out_of_view)
+
+
+def _read_sweep_units(store: Store, summary: Any) -> Any:
+    """Read what maps the rows of a sweep to independent units; None for other runs."""
+    if summary.command != "sweep":
+        return None
+    is_sampled = summary.sampler is not None
+    return workbench.read_units(store, is_sampled=is_sampled)
+
+
+def _name_independent_unit(
+    row: Any, folder: Path, seed: int, summary: Any, sweep_units: Any
+) -> str:
+    """Name the independent unit that a row belongs to.
+
+    Args:
+        row: row of a sweep, or trial of an attack.
+        folder: directory of the run.
+        seed: seed of the run.
+        summary: result of the run.
+        sweep_units: maps the rows of a sweep to independent units; None for other runs.
+    """
+    # A sweep may also have rows of photographs, each of which is a unit.
+    if summary.command == "attack":
+        return f"{seed} {row.step}"
+    if row.kind == "sweep" and sweep_units is not None:
+        return f"{seed} {sweep_units.find_unit(row.step)}"
+    return f"{folder.name} {row.kind} {row.id}"
 
 
 def _read_row_values(row: Any, summary: Any) -> dict[str, Any]:
@@ -154,15 +176,21 @@ def make_frame(
     """
     frame = pd.DataFrame(rows)
     if groups:
-        group_of_object = dict[str, str]()
-        for group, objects in groups.items():
-            for name in objects:
-                group_of_object.setdefault(name, group)
+        group_of_object = _map_objects_to_groups(groups)
         frame[GROUP_COLUMN] = [
             group_of_object.get(name, OTHER_OBJECTS) for name in frame["object"]
         ]
     frame.attrs = facts
     return frame
+
+
+def _map_objects_to_groups(groups: Mapping[str, Sequence[str]]) -> dict[str, str]:
+    """Return the first group that names an object, by the name of the object."""
+    group_of_object = dict[str, str]()
+    for group, objects in groups.items():
+        for name in objects:
+            group_of_object.setdefault(name, group)
+    return group_of_object
 
 
 def get_column(rows: Rows, name: str) -> Any:
@@ -344,26 +372,44 @@ def describe_extremes(
     lowest = known[int(np.argmin(shares))]
     highest = known[int(np.argmax(shares))]
     if lowest.fraction == highest.fraction:
-        return [
-            f"All {len(known)} {things} have the same share, "
-            f"{wording.percent(lowest.fraction)}: no difference is shown."
-        ]
-
-    descriptions = []
-    for tally in (lowest, highest):
-        n_ties = shares.count(tally.fraction or 0.0) - 1  # without the fraction itself
-        ties = _format_ties(n_ties)
-        descriptions.append(f"is {tally.name}{ties}: {tally.describe(verb)}")
-    widened = (
-        f"the intervals of the two, widened for having been chosen among {len(known)},"
-    )
-    verdict = f"No difference between the {things} is shown: {widened} overlap."
-    if lowest.is_below(highest, len(known)):
-        verdict = f"The difference is shown: {widened} do not overlap."
+        return [_describe_equal_shares(lowest, len(known), things)]
+    lowest_text = _describe_extreme(lowest, shares, verb)
+    highest_text = _describe_extreme(highest, shares, verb)
     return [
-        f"{lowest_prefix} {descriptions[0]}; {highest_prefix} {descriptions[1]}.",
-        verdict,
+        f"{lowest_prefix} {lowest_text}; {highest_prefix} {highest_text}.",
+        _compare_extremes(lowest, highest, len(known), things),
     ]
+
+
+def _describe_equal_shares(
+    tally: ClusteredFraction, n_fractions: int, things: str
+) -> str:
+    """State that all of several fractions are equal to the one given as `tally`."""
+    return (
+        f"All {n_fractions} {things} have the same share, "
+        f"{wording.percent(tally.fraction)}: no difference is shown."
+    )
+
+
+def _describe_extreme(
+    tally: ClusteredFraction, shares: Sequence[float], verb: str
+) -> str:
+    """Describe an extreme fraction, and how many of all shares are equal to it."""
+    n_ties = shares.count(tally.fraction or 0.0) - 1  # without the fraction itself
+    ties = _format_ties(n_ties)
+    return f"is {tally.name}{ties}: {tally.describe(verb)}"
+
+
+def _compare_extremes(
+    lowest: ClusteredFraction, highest: ClusteredFraction, n_known: int, things: str
+) -> str:
+    """State whether two fractions that were selected among `n_known` differ."""
+    widened = (
+        f"the intervals of the two, widened for having been chosen among {n_known},"
+    )
+    if lowest.is_below(highest, n_known):
+        return f"The difference is shown: {widened} do not overlap."
+    return f"No difference between the {things} is shown: {widened} overlap."
 
 
 def _format_ties(n_ties: int) -> str:
@@ -483,6 +529,11 @@ class RatesOptions(Options):
         return (*self.of, self.beside)
 
     @property
+    def verb(self) -> str:
+        """The word for what is counted: "wrong" or "right"."""
+        return "wrong" if self.wrong else "right"
+
+    @property
     def axis_label(self) -> str:
         """The label of the axis: the column, or the distance from a value of it."""
         if self.away_from is None:
@@ -500,48 +551,114 @@ def make_rates_figure(rows: Rows, options: RatesOptions) -> FigureContent:
     Raises:
         InputError: if there are no rows, or the columns don't suit the options.
     """
-    verb = "wrong" if options.wrong else "right"
     baseline_rows, rows = _split_baseline(rows, options)
     if rows.empty:
         raise InputError(
             "figures: rates: expected rows of a part beside "
             f"{options.beside!r}, got none"
         )
-    series_values = list(split_rows(rows, options.series)) if options.series else [""]
-    series = [options.names.get(value, value) for value in series_values]
-    cells, bin_centers = _count_cells(rows, series_values, options)
-    totals = _count_series("all", rows, series_values, options)
-    bars = dict(cells)
+    return _RatesContent.from_predictions(rows, baseline_rows, options).make_figure()
 
-    text = _describe_cells(cells, series, bin_centers is not None, options)
-    text += _describe_series(cells, totals, series, options)
-    if options.beside and len(baseline_rows):
-        # The baseline is the part that all others are compared with. It is the first
-        # bar.
-        baseline_name = options.names.get(options.beside, options.beside)
-        baseline = _count_series("", baseline_rows, series_values, options)
-        text += _compare_with_baseline(baseline_name, baseline, totals, series, verb)
-        bars = {baseline_name: baseline, **cells}
 
-    def draw(figure: Any) -> None:
+@dataclass(frozen=True)
+class _RatesContent:
+    """The fractions that a figure of rates shows.
+
+    Attributes:
+        options: options of the figure.
+        series: names of the series; a single one without a column of series.
+        cells: for each bar by its name, a fraction for each series.
+        totals: fraction of each series over all bars.
+        baseline: fraction of each series in the part that all others are compared with;
+            None without one.
+        bin_centers: centers of the bins; None if the bars are single values.
+        rows: the rows, without those of the baseline.
+    """
+
+    options: RatesOptions
+    series: Sequence[str]
+    cells: Cells
+    totals: Sequence[ClusteredFraction]
+    baseline: Sequence[ClusteredFraction] | None
+    bin_centers: Sequence[float] | None
+    rows: Rows
+
+    @classmethod
+    def from_predictions(
+        cls, rows: Rows, baseline_rows: Rows, options: RatesOptions
+    ) -> _RatesContent:
+        """Count the predictions of some rows for each bar and series.
+
+        Args:
+            rows: the rows without those of the baseline, the part that all others are
+                compared with.
+            baseline_rows: rows of the baseline; may be empty.
+            options: options of the figure.
+        """
+        values = list(split_rows(rows, options.series)) if options.series else [""]
+        cells, bin_centers = _count_cells(rows, values, options)
+        totals = _count_series("all", rows, values, options)
+        baseline = None
+        if options.beside and len(baseline_rows):
+            baseline = _count_series("", baseline_rows, values, options)
+        series = [options.names.get(value, value) for value in values]
+        return cls(options, series, cells, totals, baseline, bin_centers, rows)
+
+    def make_figure(self) -> FigureContent:
+        """Make the figure: its sentences, its table and how it is drawn."""
+        options = self.options
+        series_column = [options.series] if options.series else []
+        # numbers of groups of bars, of rows of a map, and of series
+        numbers = len(self.bars), len(self.cells), len(self.series)
+        return FigureContent(
+            title=f"{'Error' if options.wrong else 'Accuracy'} by "
+            f"{_name_columns(options)}",
+            text=self._describe_rates(),
+            columns=[options.by, *series_column, options.verb, *FRACTION_HEADS],
+            rows=_tabulate_rates(self.bars, self.totals, self.series, options),
+            draw=self.draw,
+            size=_choose_size(*numbers, options),
+        )
+
+    @property
+    def baseline_name(self) -> str:
+        """The name of the part that all others are compared with; empty without one."""
+        part = self.options.beside or ""
+        return self.options.names.get(part, part)
+
+    @property
+    def bars(self) -> Cells:
+        """For each bar a fraction for each series; the baseline is the first bar."""
+        if self.baseline is None:
+            return self.cells
+        return {self.baseline_name: self.baseline, **self.cells}
+
+    def _describe_rates(self) -> list[str]:
+        """Describe the extremes, the series, and the difference from the baseline."""
+        is_binned = self.bin_centers is not None
+        text = _describe_cells(self.cells, self.series, is_binned, self.options)
+        text += _describe_series(self.cells, self.totals, self.series, self.options)
+        if self.baseline is not None:
+            text += _compare_with_baseline(
+                self.baseline_name,
+                self.baseline,
+                self.totals,
+                self.series,
+                self.options.verb,
+            )
+        return text
+
+    def draw(self, figure: Any) -> None:
         """Draw lines over the bins, or else bars or a map."""
-        if options.form == "lines":
+        if self.options.form == "lines":
             # Lines are drawn over bins, but a single value has no center.
-            positions = bin_centers or range(len(cells))
-            unit = format_unit(rows, options.by).strip()
-            _draw_rate_lines(figure, cells, series, positions, unit, options)
+            positions = self.bin_centers or range(len(self.cells))
+            unit = format_unit(self.rows, self.options.by).strip()
+            _draw_rate_lines(
+                figure, self.cells, self.series, positions, unit, self.options
+            )
         else:
-            _draw_rates(figure, bars, cells, series, options)
-
-    series_column = [options.series] if options.series else []
-    return FigureContent(
-        title=f"{'Error' if options.wrong else 'Accuracy'} by {_name_columns(options)}",
-        text=text,
-        columns=[options.by, *series_column, verb, *FRACTION_HEADS],
-        rows=_tabulate_rates(bars, totals, series, options),
-        draw=draw,
-        size=_choose_size(len(bars), len(cells), len(series), options),
-    )
+            _draw_rates(figure, self.bars, self.cells, self.series, self.options)
 
 
 def _split_baseline(rows: Rows, options: RatesOptions) -> tuple[Rows, Rows]:
@@ -584,9 +701,16 @@ def _count_cells(
         get_column(rows, options.by)
     )
     if options.form == "bars" and are_names:
-        order = sorted(cells, key=lambda name: -(cells[name][0].fraction or 0.0))
-        cells = {name: cells[name] for name in order}
+        cells = _sort_by_first_series(cells)
     return cells, bin_centers
+
+
+def _sort_by_first_series(
+    cells: dict[str, list[ClusteredFraction]],
+) -> dict[str, list[ClusteredFraction]]:
+    """Sort bars by their fraction in the first series, the highest first."""
+    order = sorted(cells, key=lambda name: -(cells[name][0].fraction or 0.0))
+    return {name: cells[name] for name in order}
 
 
 def _count_series(
@@ -643,28 +767,47 @@ def _describe_cells(
     """
     if options.form == "map":
         return _describe_map_cells(cells, series, options)
-    verb = "wrong" if options.wrong else "right"
-    text = list[str]()
     where = f" where {options.axis_label}" if is_binned else ""
-    has_several_series = len(series) > 1
+    if len(series) == 1:
+        return _describe_bars(_select_series(cells, 0), "Lowest", where, options)
+    text = list[str]()
     for index, name in enumerate(series):
-        tallies = [
-            fractions[index].with_name(bar_name)
-            for bar_name, fractions in cells.items()
-        ]
+        tallies = _select_series(cells, index)
         n_known = sum(tally.total > 0 for tally in tallies)
-        # With a single bar there is nothing to compare within a series.
-        if has_several_series and n_known < 2:
-            continue
-        lowest = f"For {name}, lowest" if has_several_series else "Lowest"
-        text += describe_extremes(
-            tallies,
-            lowest_prefix=f"{lowest}{where}",
-            highest_prefix=f"highest{where}",
-            things=pluralize_column(options.by),
-            verb=verb,
-        )
+        if n_known > 1:  # a single bar can be compared with no other of the series
+            text += _describe_bars(tallies, f"For {name}, lowest", where, options)
     return text
+
+
+def _describe_bars(
+    tallies: Sequence[ClusteredFraction],
+    beginning: str,
+    where: str,
+    options: RatesOptions,
+) -> list[str]:
+    """Describe the lowest and the highest bar of a series.
+
+    Args:
+        tallies: the fraction of each bar.
+        beginning: first words of the sentence, such as "Lowest".
+        where: the words that name a binned parameter, such as " where elevation";
+            empty if the bars are no bins.
+        options: options of the figure.
+    """
+    return describe_extremes(
+        tallies,
+        lowest_prefix=f"{beginning}{where}",
+        highest_prefix=f"highest{where}",
+        things=pluralize_column(options.by),
+        verb=options.verb,
+    )
+
+
+def _select_series(cells: Cells, index: int) -> list[ClusteredFraction]:
+    """Return the fractions of one series, each under the name of its bar."""
+    return [
+        fractions[index].with_name(bar_name) for bar_name, fractions in cells.items()
+    ]
 
 
 def _describe_map_cells(
@@ -678,8 +821,8 @@ def _describe_map_cells(
         options: options of the figure.
     """
     pairs = []
+    names = _name_series(series, options)
     for row_name, tallies in cells.items():
-        names = _name_series(series, options)
         for name, tally in zip(names, tallies, strict=True):
             pairs.append(tally.with_name(f"{row_name} with {name}"))
     return describe_extremes(
@@ -687,7 +830,7 @@ def _describe_map_cells(
         lowest_prefix="The lowest pair",
         highest_prefix="the highest",
         things=f"pairs of {_name_columns(options)}",
-        verb="wrong" if options.wrong else "right",
+        verb=options.verb,
     )
 
 
@@ -711,24 +854,37 @@ def _describe_series(
     """
     if not options.series or len(series) < 2:
         return []
-    verb = "wrong" if options.wrong else "right"
     # The sentence becomes "Over all, the lowest share is that of NAME: ...".
-    overall = []
-    for name, tally in zip(_name_series(series, options), totals, strict=True):
-        overall.append(tally.with_name(f"that of {name}"))
-    sentences = describe_extremes(
-        overall,
-        lowest_prefix="Over all, the lowest share",
-        highest_prefix="the highest",
-        things=pluralize_column(options.series),
-        verb=verb,
-    )
+    overall = [
+        tally.with_name(f"that of {name}")
+        for name, tally in zip(_name_series(series, options), totals, strict=True)
+    ]
+    sentences = _describe_overall(overall, options.series, options.verb)
     # Figures of other columns have the same sentences, and `omit_repeated_sentences`
     # drops equal texts. So they are one text here.
     text = [" ".join(sentences)]
     if options.wrong and options.series == MODEL_COLUMN:
         text += _describe_mean_errors(cells, series)
     return text
+
+
+def _describe_overall(
+    overall: Sequence[ClusteredFraction], series_column: str, verb: str
+) -> list[str]:
+    """Describe the series with the lowest and that with the highest fraction of all.
+
+    Args:
+        overall: the fraction of each series over all bars.
+        series_column: name of the column that separates the series.
+        verb: word for what is counted, for example "right" or "wrong".
+    """
+    return describe_extremes(
+        overall,
+        lowest_prefix="Over all, the lowest share",
+        highest_prefix="the highest",
+        things=pluralize_column(series_column),
+        verb=verb,
+    )
 
 
 def _describe_mean_errors(cells: Cells, models: Sequence[str]) -> Iterator[str]:
@@ -844,19 +1000,25 @@ def _draw_rates(
         options: options of the figure.
     """
     axes = figure.subplots()
-    label = f"{'wrong' if options.wrong else 'right'}, share"
+    label = f"{options.verb}, share"
     if options.form == "map":
         _draw_map(axes, cells, series, label)
         axes.set(ylabel=options.by, xlabel=options.series or "")
         return
-    shares = {
-        row_name: [tally.fraction_with_interval for tally in tallies]
-        for row_name, tallies in bars.items()
-    }
-    figures.draw_fractions(axes, shares, series)
+    figures.draw_fractions(axes, _list_fractions_with_intervals(bars), series)
     axes.set(xlabel=f"{label} with 95 % interval")
     if len(series) > 1:
         figure.legend(loc="outside lower center", ncols=min(len(series), 3))
+
+
+def _list_fractions_with_intervals(
+    bars: Cells,
+) -> dict[str, list[tuple[float, results.Interval] | None]]:
+    """Return the fractions of bars with their intervals, as a bar chart takes them."""
+    return {
+        name: [tally.fraction_with_interval for tally in tallies]
+        for name, tallies in bars.items()
+    }
 
 
 def _draw_rate_lines(
@@ -879,9 +1041,8 @@ def _draw_rate_lines(
     """
     axes = figure.subplots()
     _draw_lines(axes, cells, series, positions)
-    label = f"{'wrong' if options.wrong else 'right'}, share"
     x_label = f"{options.axis_label} [{unit}]" if unit else options.axis_label
-    axes.set(xlabel=x_label, ylabel=f"{label} with 95 % interval")
+    axes.set(xlabel=x_label, ylabel=f"{options.verb}, share with 95 % interval")
     if len(series) > 1:
         figure.legend(loc="outside lower center", ncols=min(len(series), 3))
 
@@ -904,24 +1065,51 @@ def _group_rows(
     """
     if options.bins is None and options.form != "lines":
         return split_rows(rows, options.by), None
+    return _split_into_bins(rows, options)
+
+
+def _split_into_bins(
+    rows: Rows, options: RatesOptions
+) -> tuple[dict[str, Rows], list[float]]:
+    """Split rows by bins of equal width of a column, without those outside of its range.
+
+    Returns:
+        The rows by the name of the bin, and the centers of the bins.
+    """
     values = _read_binned_values(rows, options)
     n_bins = options.bins or DEFAULT_BINS
+    lower, upper = _find_binned_range(values, options)
+    bin_index = _find_bins(values, lower, upper, n_bins)
+    edges = [lower + (upper - lower) * index / n_bins for index in range(n_bins + 1)]
+    unit = format_unit(rows, options.by)
+    groups = {
+        _name_bin(start, end, unit): rows[bin_index == index]
+        for index, (start, end) in enumerate(pairwise(edges))
+    }
+    centers = [(start + end) / 2 for start, end in pairwise(edges)]
+    return groups, centers
+
+
+def _find_binned_range(values: Any, options: RatesOptions) -> tuple[float, float]:
+    """Return the range of the bins: that of the options, or else of the values (n,).
+
+    Raises:
+        InputError: the range is empty.
+    """
     lower, upper = options.range or (values.min(), values.max())
     if not upper > lower:
         raise InputError(
             f"figures: rates: expected values of {options.by} that "
             f"differ, got {lower:g} to {upper:g}"
         )
-    bin_index = _find_bins(values, lower, upper, n_bins)
-    edges = [lower + (upper - lower) * index / n_bins for index in range(n_bins + 1)]
-    groups = dict[str, Rows]()
-    centers = list[float]()
-    for index, (start, end) in enumerate(pairwise(edges)):
-        bounds = f"{wording.format_figure_value(start)} to {wording.format_figure_value(end)}"
-        name = bounds + format_unit(rows, options.by)
-        groups[name] = rows[bin_index == index]
-        centers.append((start + end) / 2)
-    return groups, centers
+    return lower, upper
+
+
+def _name_bin(start: float, end: float, unit: str) -> str:
+    """Name a bin by its bounds, which `unit` follows: ``0 to 30 deg``."""
+    lower = wording.format_figure_value(start)
+    upper = wording.format_figure_value(end)
+    return f"{lower} to {upper}{unit}"
 
 
 def _find_bins(values: Any, lower: float, upper: float, n_bins: int) -> Any:
@@ -961,6 +1149,14 @@ def _read_binned_values(rows: Rows, options: RatesOptions) -> Any:
     return np.minimum(arc, options.turn - arc)
 
 
+SLANTED_STYLE: Mapping[str, Any] = {
+    "rotation": 35,
+    "ha": "right",
+    "rotation_mode": "anchor",
+}
+"""How matplotlib draws labels that are too long to stand next to each other."""
+
+
 def _draw_map(axes: Any, cells: Cells, series: Sequence[str], label: str) -> None:
     """Draw the fractions as a matrix of colors with percentages in it.
 
@@ -975,6 +1171,20 @@ def _draw_map(axes: Any, cells: Cells, series: Sequence[str], label: str) -> Non
         for tallies in cells.values()
     ]
     image = axes.imshow(shares, cmap="RdBu", vmin=0.0, vmax=1.0, aspect="auto")
+    _draw_percentages(axes, shares)
+    are_long = max(map(len, series)) > MAX_UPRIGHT_LETTERS
+    axes.set_xticks(range(len(series)), series, **(SLANTED_STYLE if are_long else {}))
+    axes.set_yticks(range(len(cells)), list(cells))
+    axes.figure.colorbar(
+        image,
+        ax=axes,
+        label=f"{label} [%]",
+        format=lambda share, _: f"{100 * share:.0f}",
+    )
+
+
+def _draw_percentages(axes: Any, shares: list[list[float]]) -> None:
+    """Write each known share of a map (rows, columns) as a percentage into its cell."""
     for (row, column_index), share in np.ndenumerate(shares):
         if math.isnan(share):
             continue
@@ -988,17 +1198,6 @@ def _draw_map(axes: Any, cells: Cells, series: Sequence[str], label: str) -> Non
             color="white" if abs(share - 0.5) > 0.3 else "black",
             fontsize=7.5,
         )
-    label_style = dict[str, Any]()
-    if max(map(len, series)) > MAX_UPRIGHT_LETTERS:
-        label_style = {"rotation": 35, "ha": "right", "rotation_mode": "anchor"}
-    axes.set_xticks(range(len(series)), series, **label_style)
-    axes.set_yticks(range(len(cells)), list(cells))
-    axes.figure.colorbar(
-        image,
-        ax=axes,
-        label=f"{label} [%]",
-        format=lambda share, _: f"{100 * share:.0f}",
-    )
 
 
 def _draw_lines(
@@ -1013,32 +1212,41 @@ def _draw_lines(
         bin_positions: positions of the bins along the horizontal axis.
     """
     for index, name in enumerate(series):
-        positions = list[float]()
-        shares = list[float | None]()
-        lower = list[float]()
-        upper = list[float]()
-        for position, tallies in zip(bin_positions, cells.values(), strict=True):
-            tally = tallies[index]
-            if not tally.total:
-                continue
-            # An unknown interval is drawn as a band from 0 to 1.
-            interval = tally.interval() or (0.0, 1.0)
-            positions.append(position)
-            shares.append(tally.fraction)
-            lower.append(interval[0])
-            upper.append(interval[1])
+        tallies = [cell_tallies[index] for cell_tallies in cells.values()]
         color = figures.SERIES[index % len(figures.SERIES)]
-        axes.fill_between(positions, lower, upper, color=color, alpha=0.15, linewidth=0)
-        axes.plot(
-            positions,
-            shares,
-            color=color,
-            marker=figures.MARKS[index % len(figures.MARKS)],
-            ms=4,
-            label=name,
-        )
+        marker = figures.MARKS[index % len(figures.MARKS)]
+        _draw_band(axes, bin_positions, tallies, color=color, marker=marker, label=name)
     axes.set(ylim=(-0.03, 1.03))
     axes.grid(True, axis="y")
+
+
+def _draw_band(
+    axes: Any,
+    bin_positions: Sequence[float],
+    tallies: Sequence[ClusteredFraction],
+    *,
+    color: str,
+    **style: Any,
+) -> None:
+    """Draw the known fractions of one series as a line, with their intervals as a band.
+
+    Args:
+        axes: axes of matplotlib.
+        bin_positions: positions of the bins along the horizontal axis.
+        tallies: the fraction of each bin.
+        color: color of the line and of the band.
+        **style: label and marker of the line.
+    """
+    pairs = zip(bin_positions, tallies, strict=True)
+    positions = [position for position, tally in pairs if tally.total]
+    known = [tally for tally in tallies if tally.total]
+    # An unknown interval is drawn as a band from 0 to 1.
+    intervals = [tally.interval() or (0.0, 1.0) for tally in known]
+    lower = [low for low, _ in intervals]
+    upper = [high for _, high in intervals]
+    axes.fill_between(positions, lower, upper, color=color, alpha=0.15, linewidth=0)
+    shares = [tally.fraction for tally in known]
+    axes.plot(positions, shares, color=color, ms=4, **style)
 
 
 NO_PHOTOGRAPHS = (
@@ -1091,52 +1299,90 @@ def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureConten
     Raises:
         InputError: if a part has no rows or other configurations.
     """
-    rendered_part = options.of[0]
-    # A column that only rows of other parts have is empty here, and is removed.
-    renderings = _select_part(rows, rendered_part).dropna(axis=1, how="all")
-    if renderings.empty:
-        raise InputError(
-            "figures: agreement: expected predictions of a part "
-            f"{rendered_part!r}, got none"
-        )
-    objects = [ALL_OBJECTS, *renderings["object"].unique()]
-    # For each object a fraction for each series. A series is a part that the renderings
-    # are compared with.
-    bars: dict[str, list[ClusteredFraction]] = {name: [] for name in objects}
-    series = list[str]()
-    text = list[str]()
-    table = list[list[Cell]]()
+    comparison = _AgreementContent(options, _select_renderings(rows, options.of[0]))
     for part in (PHOTOGRAPHS, *options.of[1:]):
         part_rows = _select_part(rows, part)
         if part == PHOTOGRAPHS and part_rows.empty:
-            text.append(NO_PHOTOGRAPHS)
-            continue
-        pairs = _pair_rows(part_rows, renderings)
+            comparison.text.append(NO_PHOTOGRAPHS)
+        else:
+            comparison.add_part(part, part_rows)
+    n_series = len(comparison.series)
+    n_objects = len(comparison.bars) - 1  # `bars` has one entry more
+    return FigureContent(
+        title="Renderings and other pictures of the same",
+        text=comparison.text,
+        columns=AGREEMENT_HEADS,
+        rows=comparison.table,
+        draw=lambda figure: _draw_agreement(figure, comparison.bars, comparison.series),
+        # inches; a line of the legend for each series, and a row of bars for each
+        # object
+        size=(FIGURE_WIDTH, 1.7 + 0.2 * n_series + 0.34 * n_objects),
+    )
+
+
+def _select_renderings(rows: Rows, part: str) -> Rows:
+    """Return the rows of the part that has the renderings.
+
+    Raises:
+        InputError: it has no rows.
+    """
+    # A column that only rows of other parts have is empty here, and is removed.
+    renderings = _select_part(rows, part).dropna(axis=1, how="all")
+    if renderings.empty:
+        raise InputError(
+            f"figures: agreement: expected predictions of a part {part!r}, got none"
+        )
+    return renderings
+
+
+class _AgreementContent:
+    """Content of a figure of agreement, to which parts are added.
+
+    Attributes:
+        options: options of the figure.
+        renderings: rows of the renderings.
+        bars: for each object, and for `ALL_OBJECTS`, a fraction for each series.
+        series: name of each series, which is a part that renderings are compared with.
+        text: sentences.
+        table: rows of the table.
+    """
+
+    def __init__(self, options: AgreementOptions, renderings: Rows) -> None:
+        """Begin without any series."""
+        self.options = options
+        self.renderings = renderings
+        objects = [ALL_OBJECTS, *renderings["object"].unique()]
+        self.bars: dict[str, list[ClusteredFraction]] = {name: [] for name in objects}
+        self.series = list[str]()
+        self.text = list[str]()
+        self.table = list[list[Cell]]()
+
+    def add_part(self, part: str, part_rows: Rows) -> None:
+        """Compare the renderings with the rows of a part.
+
+        Raises:
+            InputError: if the part has other configurations.
+        """
+        pairs = _pair_rows(part_rows, self.renderings)
         n_unpaired = len(part_rows) - len(pairs)
         # A photograph may belong to no rendering, but rows of other parts must.
         if part != PHOTOGRAPHS and n_unpaired:
-            raise InputError(
-                f"figures: agreement: expected {part} to have the "
-                f"configurations of {rendered_part}"
-            )
-        series_name = options.names.get(part, part)
-        series.append(series_name)
-        _add_agreement(bars, pairs, table, series_name)
+            raise self._make_unpaired_error(part)
+        name = self.options.names.get(part, part)
+        self.series.append(name)
+        _add_agreement(self.bars, pairs, self.table, name)
         if len(pairs):
-            text.append(_describe_agreement(series_name, bars[ALL_OBJECTS][-1], pairs))
+            total = self.bars[ALL_OBJECTS][-1]
+            self.text.append(_describe_agreement(name, total, pairs))
         if part == PHOTOGRAPHS:
-            text += _describe_photographs(len(pairs), n_unpaired)
+            self.text += _describe_photographs(len(pairs), n_unpaired)
 
-    return FigureContent(
-        title="Renderings and other pictures of the same",
-        text=text,
-        columns=AGREEMENT_HEADS,
-        rows=table,
-        draw=lambda figure: _draw_agreement(figure, bars, series),
-        # inches; a line of the legend for each series, and a row of bars for each
-        # object, as `bars` has one entry more
-        size=(FIGURE_WIDTH, 1.7 + 0.2 * len(series) + 0.34 * (len(bars) - 1)),
-    )
+    def _make_unpaired_error(self, part: str) -> InputError:
+        """Make the error that a part has other configurations than the renderings."""
+        return InputError(
+            f"figures: agreement: expected {part} to have the "
+            f"configurations of {self.options.of[0]}"
+        )
 
 
 def _select_part(rows: Rows, part: str) -> Rows:
@@ -1175,11 +1421,7 @@ def _add_agreement(
 def _draw_agreement(figure: Any, bars: Cells, series: Sequence[str]) -> None:
     """Draw bars of the fraction of pairs that agree, for all and for each object."""
     axes = figure.subplots()
-    shares = {
-        name: [tally.fraction_with_interval for tally in tallies]
-        for name, tallies in bars.items()
-    }
-    figures.draw_fractions(axes, shares, series)
+    figures.draw_fractions(axes, _list_fractions_with_intervals(bars), series)
     axes.set(xlabel="share that agrees, with 95 % interval")
     figure.legend(loc="outside lower center", ncols=1)
 
@@ -1285,6 +1527,14 @@ def _describe_where(right: bool, pairs: Rows) -> str:
     return f"Where it is {verb} about the rendering, it is {rate} about the other."
 
 
+SCALING_HEADS = [
+    "workers",
+    "object",
+    "pictures a second",
+    "times as many as the fewest workers",
+]
+
+
 def make_scaling_figure(rows: Rows, options: Options) -> FigureContent:
     """Make a figure of the images per second of sweeps, by the number of workers.
 
@@ -1295,49 +1545,61 @@ def make_scaling_figure(rows: Rows, options: Options) -> FigureContent:
     Raises:
         InputError: if no sweep sets `workers`, or a run is too short.
     """
+    rate_of_run = _compute_run_rates(rows)
+    # for each number of workers, in ascending order, the rate of each object
+    rates_by_count = {
+        int(workers): run_rates.droplevel(WORKERS_COLUMN)
+        for workers, run_rates in rate_of_run.groupby(level=WORKERS_COLUMN)
+    }
+    machine = _describe_machine(rows.attrs["cores"])
+    return FigureContent(
+        title="Pictures a second by number of workers",
+        text=[*_describe_scaling(rates_by_count), machine],
+        columns=SCALING_HEADS,
+        rows=_tabulate_scaling(rates_by_count),
+        draw=lambda figure: _draw_scaling(figure, rates_by_count, rate_of_run.max()),
+        size=(FIGURE_WIDTH, LINES_HEIGHT),
+    )
+
+
+def _describe_machine(n_cores: int) -> str:
+    """Describe the number of cores that the throughputs were measured with."""
+    cores = wording.format_count(n_cores, "core")
+    return (
+        f"This machine gives {cores}; what other programs took of it meanwhile "
+        "is in these numbers."
+    )
+
+
+def _compute_run_rates(rows: Rows) -> Any:
+    """Compute the images per second of each run, by workers and object (a pd.Series).
+
+    Raises:
+        InputError: if no sweep sets `workers`, or a run is too short.
+    """
     if WORKERS_COLUMN not in rows:
         raise InputError(
             "figures: scaling: expected sweeps with `workers` among the parts, got none"
         )
     # Each run has one object and one number of workers. Grouping leaves out the rows of
     # runs that do not set the workers.
-    rate_of_run = rows.groupby([WORKERS_COLUMN, "object"], sort=False)["time"].agg(
-        _compute_throughput
-    )
-    # for each number of workers, in ascending order, the rate of each object
-    rates_by_count = {
-        int(workers): run_rates.droplevel(WORKERS_COLUMN)
-        for workers, run_rates in rate_of_run.groupby(level=WORKERS_COLUMN)
-    }
+    runs = rows.groupby([WORKERS_COLUMN, "object"], sort=False)
+    return runs["time"].agg(_compute_throughput)
+
+
+def _tabulate_scaling(rates_by_count: Mapping[int, Any]) -> list[list[Cell]]:
+    """Return the table of a scaling figure: a row for each run.
+
+    Args:
+        rates_by_count: images per second by object (a pd.Series), by ascending worker
+            count.
+    """
     table = list[list[Cell]]()
     for workers, run_rates in rates_by_count.items():
         gains = _compute_gains(run_rates, rates_by_count)
         for name, rate in run_rates.items():
             table.append([workers, str(name), float(rate), gains.get(name)])
-    cores = wording.format_count(rows.attrs["cores"], "core")
-    text = _describe_scaling(rates_by_count)
-    text.append(
-        f"This machine gives {cores}; what other programs took of it meanwhile "
-        "is in these numbers."
-    )
-
-    def draw(figure: Any) -> None:
-        _draw_scaling(figure, rates_by_count, rate_of_run.max())
-
-    heads = [
-        "workers",
-        "object",
-        "pictures a second",
-        "times as many as the fewest workers",
-    ]
-    return FigureContent(
-        title="Pictures a second by number of workers",
-        text=text,
-        columns=heads,
-        rows=table,
-        draw=draw,
-        size=(FIGURE_WIDTH, LINES_HEIGHT),
-    )
+    return table
 
 
 def _compute_gains(run_rates: Any, rates_by_count: Mapping[int, Any]) -> Any:
@@ -1365,22 +1627,7 @@ def _describe_scaling(rates_by_count: Mapping[int, Any]) -> list[str]:
         rates_by_count: images per second by object (a pd.Series), by ascending worker
             count.
     """
-    fewest = next(iter(rates_by_count))
-    text = list[str]()
-    for workers, run_rates in rates_by_count.items():
-        sentence = (
-            f"{wording.format_count(workers, 'worker')}: "
-            f"{_format_spread(run_rates)} pictures a second"
-        )
-        gains = _compute_gains(run_rates, rates_by_count)
-        if workers > fewest and len(gains):
-            # 100 % if twice the workers give twice the throughput
-            efficiency = 100 * gains.median() * fewest / workers
-            sentence += (
-                f", {_format_spread(gains)} times as many as "
-                f"{wording.format_count(fewest, 'worker')} ({efficiency:.0f} % of linear)"
-            )
-        text.append(f"{sentence}.")
+    text = [_describe_count(workers, rates_by_count) for workers in rates_by_count]
     min_runs = min(map(len, rates_by_count.values()))
     if min_runs > 1:
         # The median of the population lies outside the range of n runs only if all n
@@ -1395,6 +1642,25 @@ def _describe_scaling(rates_by_count: Mapping[int, Any]) -> list[str]:
     return text
 
 
+def _describe_count(workers: int, rates_by_count: Mapping[int, Any]) -> str:
+    """Describe the throughput of one worker count in a sentence."""
+    fewest = next(iter(rates_by_count))
+    run_rates = rates_by_count[workers]
+    sentence = (
+        f"{wording.format_count(workers, 'worker')}: "
+        f"{_format_spread(run_rates)} pictures a second"
+    )
+    gains = _compute_gains(run_rates, rates_by_count)
+    if workers > fewest and len(gains):
+        # 100 % if twice the workers give twice the throughput
+        efficiency = 100 * gains.median() * fewest / workers
+        sentence += (
+            f", {_format_spread(gains)} times as many as "
+            f"{wording.format_count(fewest, 'worker')} ({efficiency:.0f} % of linear)"
+        )
+    return f"{sentence}."
+
+
 def _draw_scaling(
     figure: Any, rates_by_count: Mapping[int, Any], max_rate: float
 ) -> None:
@@ -1407,38 +1673,33 @@ def _draw_scaling(
     """
     axes = figure.subplots()
     counts = list(rates_by_count)
-    fewest, slowest = next(iter(rates_by_count.items()))
-    linear = [slowest.median() / fewest * workers for workers in counts]
-    axes.plot(
-        counts,
-        linear,
-        color="0.7",
-        label=f"linear, from {wording.format_count(fewest, 'worker')}",
-    )
-    for workers, run_rates in rates_by_count.items():
-        axes.plot(
-            [workers] * 2,
-            [run_rates.min(), run_rates.max()],
-            color=figures.BLUE,
-            alpha=0.45,
-            linewidth=3,
-        )
-    axes.plot(
-        counts,
-        [run_rates.median() for run_rates in rates_by_count.values()],
-        "o-",
-        color=figures.BLUE,
-        ms=5,
-        label="median; bar: lowest to highest run",
-    )
+    linear = _compute_linear_rates(rates_by_count)
+    label = f"linear, from {wording.format_count(counts[0], 'worker')}"
+    axes.plot(counts, linear, color="0.7", label=label)
+    _draw_throughputs(axes, rates_by_count)
     axes.set_xticks(counts, list(map(str, counts)))
-    axes.set(
-        xlabel="workers",
-        ylabel="pictures a second",
-        ylim=(0.0, 1.08 * max(*linear, max_rate)),
-    )
+    y_end = 1.08 * max(*linear, max_rate)  # 8 % of room above the highest value
+    axes.set(xlabel="workers", ylabel="pictures a second", ylim=(0.0, y_end))
     axes.grid(True, axis="y")
     figure.legend(loc="outside lower center", ncols=2)
+
+
+def _compute_linear_rates(rates_by_count: Mapping[int, Any]) -> list[float]:
+    """Compute the rate of each worker count if it grew linearly from the fewest."""
+    fewest, slowest = next(iter(rates_by_count.items()))
+    return [slowest.median() / fewest * workers for workers in rates_by_count]
+
+
+def _draw_throughputs(axes: Any, rates_by_count: Mapping[int, Any]) -> None:
+    """Draw the median of each worker count as a point, and the range as a bar."""
+    bar_style = {"color": figures.BLUE, "alpha": 0.45, "linewidth": 3}
+    for workers, run_rates in rates_by_count.items():
+        bounds = [run_rates.min(), run_rates.max()]
+        axes.plot([workers, workers], bounds, **bar_style)
+    medians = [run_rates.median() for run_rates in rates_by_count.values()]
+    label = "median; bar: lowest to highest run"
+    counts = list(rates_by_count)
+    axes.plot(counts, medians, "o-", color=figures.BLUE, ms=5, label=label)
 
 
 def _compute_throughput(times: Any) -> float:
@@ -1468,6 +1729,17 @@ def _format_spread(values: Any) -> str:
     return f"{median} ({values.min():.3g} to {values.max():.3g})"
 
 
+SURFACE_HEADS = [
+    "object",
+    "model",
+    "parts",
+    "seen",
+    "compared",
+    "with wrong predictions",
+    "with right predictions",
+]
+
+
 def _make_surface_cells(surface_table: Any) -> list[Cell]:
     """Return the cells of a table's row about one object, model and kind of part."""
     return [
@@ -1494,43 +1766,44 @@ def make_surface_figure(rows: Rows, options: Options) -> FigureContent:
         InputError: if no sweep has `surface: true`.
     """
     surface_of_run = rows.attrs["surfaces"]
+    _check_surfaces(surface_of_run)
+    text = list[str]()
+    table = list[list[Cell]]()
+    for surface in surface_of_run.values():
+        text += workbench.surface_sentences(surface)
+        table += map(_make_surface_cells, surface.tables)
+    folder = rows.attrs["folder"]
+    return FigureContent(
+        title="Which parts of the surface go with wrong predictions",
+        text=text,
+        columns=SURFACE_HEADS,
+        rows=table,
+        draw=lambda figure: _draw_surfaces(figure, folder, list(surface_of_run)),
+        size=(6.4, 2.65 * len(surface_of_run)),
+    )
+
+
+def _check_surfaces(surface_of_run: Mapping[str, Any]) -> None:
+    """Raise an error if no sweep has a summary of its object's surface."""
     if not surface_of_run:
         raise InputError(
             "figures: surface: expected a sweep with `surface: true` "
             "among its parts, got none"
         )
 
-    def draw(figure: Any) -> None:
-        """Draw the figures of the runs below each other."""
-        from matplotlib.image import imread  # matplotlib takes half a second
 
-        all_axes = figure.subplots(len(surface_of_run), squeeze=False)[:, 0]
-        for axes, run in zip(all_axes, surface_of_run, strict=True):
-            directory = RunDirectory.locate_part(rows.attrs["folder"], run)
-            axes.imshow(imread(directory / "images" / "surface.png"))
-            axes.axis("off")
+def _draw_surfaces(figure: Any, folder: Path, runs: Sequence[str]) -> None:
+    """Draw the surface figures of runs of a recipe below each other.
 
-    table = list[list[Cell]]()
-    text = list[str]()
-    for surface in surface_of_run.values():
-        text += workbench.surface_sentences(surface)
-        table += [
-            _make_surface_cells(surface_table) for surface_table in surface.tables
-        ]
-    heads = [
-        "object",
-        "model",
-        "parts",
-        "seen",
-        "compared",
-        "with wrong predictions",
-        "with right predictions",
-    ]
-    return FigureContent(
-        title="Which parts of the surface go with wrong predictions",
-        text=text,
-        columns=heads,
-        rows=table,
-        draw=draw,
-        size=(6.4, 2.65 * len(surface_of_run)),
-    )
+    Args:
+        figure: figure of matplotlib.
+        folder: directory of the recipe's run.
+        runs: names of the runs.
+    """
+    from matplotlib.image import imread  # matplotlib takes half a second
+
+    all_axes = figure.subplots(len(runs), squeeze=False)[:, 0]
+    for axes, run in zip(all_axes, runs, strict=True):
+        directory = RunDirectory.locate_part(folder, run)
+        axes.imshow(imread(directory / "images" / "surface.png"))
+        axes.axis("off")

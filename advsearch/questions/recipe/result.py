@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path, PurePath
 from typing import Any, ClassVar, Literal
 
@@ -173,6 +173,7 @@ class RecipeConfig(Config):
 
 # columns of a figure's numbers: a fraction, and the bounds of its 95 % interval
 FRACTION_COLUMNS = ("share", "low", "high")
+QUICK_REMARK = "Made with few and small pictures, to see what comes out; no result."
 
 
 class RecipePart(results.Fields):
@@ -227,20 +228,15 @@ def make_view(result: RecipeResult) -> ShownResult:
     sections += _list_figures(result)
     sections.append(_list_runs(result.parts))
     objects = ", ".join(map(wording.shorten_name, result.objects))
-    environments = _shorten_names(result.environment)
     models = _shorten_names(result.model)
     facts = {
         "objects": objects,
-        "environments": environments,
+        "environments": _shorten_names(result.environment),
         "models": models,
         "runs": str(len(result.parts)),
         "renders": str(sum(run.renders for run in result.parts)),
     }
-    remarks = list[str]()
-    if result.quick:
-        remarks.append(
-            "Made with few and small pictures, to see what comes out; no result."
-        )
+    remarks = [QUICK_REMARK] if result.quick else []
     recipe_name = PurePath(result.recipe).stem
     return ShownResult(
         result.title, sections, facts, [recipe_name, models, objects], remarks
@@ -257,17 +253,20 @@ def _list_figures(result: RecipeResult) -> list[ResultPart]:
     ):
         image = f"images/figure-{number}.png"
         sections.append(ResultPart(figure.title, text, figure=image))
-        rows = [list(map(_format_cell, figure.columns, row)) for row in figure.rows]
-        sections.append(
-            ResultPart(
-                "The numbers",
-                column_heads=figure.columns,
-                rows=rows,
-                folded=True,
-                only_medium="page",
-            )
-        )
+        sections.append(_make_numbers_part(figure))
     return sections
+
+
+def _make_numbers_part(figure: RecipeFigure) -> ResultPart:
+    """Make the section with the numbers of a figure."""
+    rows = [list(map(_format_cell, figure.columns, row)) for row in figure.rows]
+    return ResultPart(
+        "The numbers",
+        column_heads=figure.columns,
+        rows=rows,
+        folded=True,
+        only_medium="page",
+    )
 
 
 def _list_runs(parts: Sequence[RecipePart]) -> ResultPart:
@@ -307,16 +306,20 @@ def omit_repeated_sentences(figures: Sequence[RecipeFigure]) -> list[list[str]]:
     remaining = list[list[str]]()
     previous: RecipeFigure | None = None
     for figure in figures:
-        new = [
-            sentence
-            for sentence in figure.text
-            if sentence not in reported or not re.search(r"\d of \d", sentence)
-        ]
         if previous is not None and figure.text == previous.text:
             new = ["It says the same as the figure before it."]
-        elif not new:
-            new = ["It says what figures before it say."]
-        remaining.append(new)
+        else:
+            new = _select_new_sentences(figure.text, reported)
+        remaining.append(new or ["It says what figures before it say."])
         reported |= set(figure.text)
         previous = figure
     return remaining
+
+
+def _select_new_sentences(text: Sequence[str], reported: Collection[str]) -> list[str]:
+    """Return the sentences that have no count, or are not yet reported."""
+    return [
+        sentence
+        for sentence in text
+        if sentence not in reported or not re.search(r"\d of \d", sentence)
+    ]

@@ -99,25 +99,10 @@ def grow_box(
     Raises:
         InputError: there are no samples, or the center lies outside the unit box.
     """
-    if samples < 1:
-        raise InputError(f"samples: expected at least 1, got {samples}")
-    is_inside = bool(((center >= 0.0) & (center <= 1.0)).all())
-    if not is_inside:
-        raise InputError(
-            "the centre of a region has to lie inside the ranges of its parameters"
-        )
+    _check_growing(center, samples)
     box = GrowingBox(is_same, center, seed)
     box.grow()
-    n_exceptions = 0
-    for attempt in range(ATTEMPTS):
-        on_check()
-        exceptions = box.sample_exceptions(samples)
-        n_exceptions = len(exceptions)
-        is_last = attempt == ATTEMPTS - 1
-        if n_exceptions == 0 or is_last:
-            break
-        for point in exceptions:
-            box.exclude(point)
+    n_exceptions = box.shrink(samples, on_check)
     return GrownBox(
         center=center,
         low=box.low,
@@ -126,6 +111,17 @@ def grow_box(
         samples=samples,
         renders=box.n_evaluated,
     )
+
+
+def _check_growing(center: Tensor, samples: int) -> None:
+    """Raise an error without samples, or with a center (d,) outside the unit box."""
+    if samples < 1:
+        raise InputError(f"samples: expected at least 1, got {samples}")
+    is_inside = bool(((center >= 0.0) & (center <= 1.0)).all())
+    if not is_inside:
+        raise InputError(
+            "the centre of a region has to lie inside the ranges of its parameters"
+        )
 
 
 class GrowingBox:
@@ -166,6 +162,28 @@ class GrowingBox:
                 has_moved = any(moves)
             fraction /= 2.0
 
+    def shrink(self, samples: int, on_check: Callable[[], None]) -> int:
+        """Exclude points with another prediction, until a check finds none.
+
+        Args:
+            samples: number of samples of each check; there are at most `ATTEMPTS`.
+            on_check: called at the beginning of each check.
+
+        Returns:
+            The number of exceptions in the last check.
+        """
+        n_exceptions = 0
+        for attempt in range(ATTEMPTS):
+            on_check()
+            exceptions = self.sample_exceptions(samples)
+            n_exceptions = len(exceptions)
+            is_last = attempt == ATTEMPTS - 1
+            if n_exceptions == 0 or is_last:
+                break
+            for point in exceptions:
+                self.exclude(point)
+        return n_exceptions
+
     def sample_exceptions(self, count: int) -> Tensor:
         """Sample points of the box; return those (n, d) with another prediction."""
         points = self._sample(self.low, self.high, count)
@@ -183,6 +201,15 @@ class GrowingBox:
         is_inside = bool(((point >= self.low) & (point <= self.high)).all())
         if not is_inside:
             return
+        axis = self._find_axis_to_cut(point)
+        is_upper = bool(point[axis] > self._center[axis])
+        # From the center, the fraction `PULLED_IN` (below 1) of the way to the point: so
+        # the point is a little outside.
+        new_bound = torch.lerp(self._center[axis], point[axis], PULLED_IN)
+        self._move_face(axis, is_upper, new_bound)
+
+    def _find_axis_to_cut(self, point: Tensor) -> int:
+        """Return the axis along which a point (d,) is excluded by the smallest cut."""
         width = (self.high - self.low).clamp_min(1e-12)  # not divided by 0
         # For each axis (d,), the fraction of the box that is cut off if the face on the
         # point's side of the center moves to the point.
@@ -194,15 +221,12 @@ class GrowingBox:
         # No face can exclude the point along an axis where it is at the center, which
         # stays inside.
         lost_fraction = torch.where(point == self._center, torch.inf, lost_fraction)
-        axis = int(lost_fraction.argmin())
-        is_upper = point[axis] > self._center[axis]
-        # From the center, the fraction `PULLED_IN` (below 1) of the way to the point: so
-        # the point is a little outside.
-        new_bound = torch.lerp(self._center[axis], point[axis], PULLED_IN)
-        if is_upper:
-            self.high[axis] = new_bound
-        else:
-            self.low[axis] = new_bound
+        return int(lost_fraction.argmin())
+
+    def _move_face(self, axis: int, is_upper: bool, bound: Tensor) -> None:
+        """Move the upper or the lower face of an axis to a bound, a number."""
+        corner = self.high if is_upper else self.low
+        corner[axis] = bound
 
     def _push(self, face: int, fraction: float) -> bool:
         """Move a face outwards if the slab that this adds has the center's prediction.
@@ -224,28 +248,34 @@ class GrowingBox:
         step = _choose_step(distance, fraction)
         if step is None:
             return False
+        outer = self.high[axis] + step if is_upper else self.low[axis] - step
+        probes = self._sample_slab(axis, bool(is_upper), outer)
+        if not all(self._evaluate(point) for point in probes):
+            return False
+        # Rounding may lead a little outside of [0, 1].
+        self._move_face(axis, bool(is_upper), outer.clamp(0.0, 1.0))
+        return True
+
+    def _sample_slab(self, axis: int, is_upper: bool, outer: Tensor) -> Tensor:
+        """Return points (n, d) of the slab between a face and where it would move.
+
+        Args:
+            axis: axis of the face.
+            is_upper: whether the face is the upper one.
+            outer: the coordinate that the face would move to.
+        """
         slab_low = self.low.clone()
         slab_high = self.high.clone()
         if is_upper:
             slab_low[axis] = self.high[axis]
-            slab_high[axis] = self.high[axis] + step
-            outer = slab_high[axis]
+            slab_high[axis] = outer
         else:
-            slab_low[axis] = self.low[axis] - step
+            slab_low[axis] = outer
             slab_high[axis] = self.low[axis]
-            outer = slab_low[axis]
         probes = self._sample(slab_low, slab_high, PROBES)
         # One point is on the outer face, which random points never reach.
         probes[0, axis] = outer
-        if not all(self._evaluate(point) for point in probes):
-            return False
-        # Rounding may lead a little outside of [0, 1].
-        new_bound = outer.clamp(0.0, 1.0)
-        if is_upper:
-            self.high[axis] = new_bound
-        else:
-            self.low[axis] = new_bound
-        return True
+        return probes
 
     def _evaluate(self, u: Tensor) -> bool:
         """Return whether a point has the center's prediction, and count it."""

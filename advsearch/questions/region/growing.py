@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -70,13 +71,7 @@ def find_region(context: RunContext[RegionConfig]) -> RegionResult:
     """
     config = context.config
     stages = context.stages
-    stages.begin("setup", workbench.LOADING)
-    # A budget limits the ranges of controls. With the budget of the run in `around`, the
-    # ranges contain its adversarial configuration, which is the center.
-    attack_config = AttackConfig.from_config(config, **_read_budget(config))
-    problem, warnings = workbench.problem_from_config(attack_config)
-    for text in warnings:
-        stages.progress.message(text)
+    problem, warnings = _load_region_problem(context)
     varied = find_varied(problem, config)
     ladder = workbench.choose_ladder(config.verify_spp, config.pixel_sampler)
     verifier = workbench.Verifier.open(context.run, problem, ladder, stages)
@@ -99,6 +94,26 @@ def find_region(context: RunContext[RegionConfig]) -> RegionResult:
         renders=count_renders(verifier),
         seconds={**stages.seconds, "total": stages.total_seconds},
     )
+
+
+def _load_region_problem(
+    context: RunContext[RegionConfig],
+) -> tuple[Problem, list[str]]:
+    """Load the problem whose region is sought, and show the warnings about it.
+
+    Returns:
+        The problem, and the warnings.
+    """
+    config = context.config
+    stages = context.stages
+    stages.begin("setup", workbench.LOADING)
+    # A budget limits the ranges of controls. With the budget of the run in `around`, the
+    # ranges contain its adversarial configuration, which is the center.
+    attack_config = AttackConfig.from_config(config, **_read_budget(config))
+    problem, warnings = workbench.problem_from_config(attack_config)
+    for text in warnings:
+        stages.progress.message(text)
+    return problem, warnings
 
 
 def _read_budget(config: RegionConfig) -> dict[str, object]:
@@ -155,24 +170,35 @@ def find_varied(problem: Problem, config: RegionConfig) -> VariedParameters:
     names = tuple(coordinate_by_name)
     if config.vary is not None:
         names = settings.split_names(config.vary)
+    _check_varied(names, coordinate_by_name, has_map=bool(config.map))
+    # their indices among the coordinates of a configuration
+    coordinates = torch.tensor([coordinate_by_name[name] for name in names])
+    return VariedParameters(names, coordinates, read_center(problem, config))
+
+
+def _check_varied(
+    names: Sequence[str], known: Mapping[str, int], *, has_map: bool
+) -> None:
+    """Raise an error if a box cannot grow in some parameters, or a map not show them.
+
+    Args:
+        names: names of the parameters.
+        known: the parameters that the controls search, by name.
+        has_map: whether a map is drawn.
+    """
     for name in names:
-        if name not in coordinate_by_name:
-            raise errors.UnknownNameError(
-                "parameter in `vary`", name, coordinate_by_name
-            )
+        if name not in known:
+            raise errors.UnknownNameError("parameter in `vary`", name, known)
     if not 1 <= len(names) <= MAX_PARAMETERS:
         raise InputError(
             f"vary: expected 1 to {MAX_PARAMETERS} parameters, got {len(names)}; "
-            f"name some of {', '.join(coordinate_by_name)}"
+            f"name some of {', '.join(known)}"
         )
-    if config.map and len(names) != 2:
+    if has_map and len(names) != 2:
         raise InputError(
             f"map: expected two parameters in `vary`, got {len(names)}: "
             f"{', '.join(names)}"
         )
-    # their indices among the coordinates of a configuration
-    coordinates = torch.tensor([coordinate_by_name[name] for name in names])
-    return VariedParameters(names, coordinates, read_center(problem, config))
 
 
 def _list_coordinates(problem: Problem) -> dict[str, int]:
@@ -245,27 +271,17 @@ class RegionSearch:
         The verdict is whether the model is right or wrong at the center. In the box the
         verdict is the same.
         """
-        config = self._config
         verifier = self._verifier
         varied = self._varied
         # Choose enough samples per pixel that noise does not decide the prediction at
         # the center.
         verifier.choose_spp({"centre": varied.center})
         self._is_wrong_at_center = find_verdict(verifier, varied.center)
-        if config.specialise:
-            # Images may be predicted if the light on surfaces is prepared, which pays
-            # only for enough images.
-            n_growing_images = boxes.USUAL_PROBED * len(varied.names)
-            n_map_images = config.map**2  # `map` is its size; 0 for no map
-            n_images = n_growing_images + n_map_images
-            workbench.prepare_surface_light(
-                verifier, varied.center, varied.coordinate_indices, n_images
-            )
+        if self._config.specialise:
+            self._prepare_light()
         grown = self._grow_box()
         sides = describe_box(verifier.problem, grown, varied)
-        margin_map = None
-        if config.map:
-            margin_map = draw_map(verifier, config.map, varied, sides, self._run)
+        margin_map = self._draw_map_of(sides)
         return GrownRegion(
             verdict="wrong" if self._is_wrong_at_center else "right",
             box=sides,
@@ -278,26 +294,46 @@ class RegionSearch:
             map=margin_map,
         )
 
+    def _draw_map_of(self, sides: Sequence[BoxSide]) -> MarginMap | None:
+        """Draw the map with the sides of the box; None without the setting `map`."""
+        size = self._config.map
+        if not size:
+            return None
+        return draw_map(self._verifier, size, self._varied, sides, self._run)
+
+    def _prepare_light(self) -> None:
+        """Prepare the light on surfaces, so that images can be predicted.
+
+        That pays only for enough images.
+        """
+        varied = self._varied
+        n_growing_images = boxes.USUAL_PROBED * len(varied.names)
+        n_map_images = self._config.map**2  # `map` is its size; 0 for no map
+        n_images = n_growing_images + n_map_images
+        workbench.prepare_surface_light(
+            self._verifier, varied.center, varied.coordinate_indices, n_images
+        )
+
     def _grow_box(self) -> boxes.GrownBox:
         """Grow the box and check it."""
-        n_parameters = len(self._varied.names)
-        hint = (
-            f"pictures of {self._verifier.run_state.spp} samples a pixel; fewer parameters "
-            "in `vary` or `verify_spp` shorten it"
-        )
-        self._verifier.progress_stages.begin(
-            "search",
-            "growing the box",
-            boxes.MAX_PROBED * n_parameters,
-            hint=hint,
-            at_most=True,
-        )
+        self._begin_growing()
         return boxes.grow_box(
             self._is_same,
             self._varied.start,
             seed=seeds.derive_seed(self._config.seed, "region"),
             samples=self._config.samples,
             on_check=self._begin_check,
+        )
+
+    def _begin_growing(self) -> None:
+        """Begin the stage in which the box grows."""
+        hint = (
+            f"pictures of {self._verifier.run_state.spp} samples a pixel; fewer parameters "
+            "in `vary` or `verify_spp` shorten it"
+        )
+        limit = boxes.MAX_PROBED * len(self._varied.names)
+        self._verifier.progress_stages.begin(
+            "search", "growing the box", limit, hint=hint, at_most=True
         )
 
     def _begin_check(self) -> None:
@@ -353,6 +389,21 @@ def find_verdict(verifier: workbench.Verifier, center: Tensor) -> bool:
     trials = list(
         verifier.try_configurations("centre", same_configurations, has_success=False)
     )
+    _check_center_trials(trials)
+    n_wrong = sum(trial.success for trial in trials)
+    # True or False, or None if both right and wrong are too frequent for a verdict
+    is_wrong = verifier.problem.verification_rule.decide(n_wrong, CENTER_TRIALS)
+    if is_wrong is None:
+        raise InputError(
+            f"the model is wrong in {n_wrong} of {CENTER_TRIALS} trials at the centre, "
+            "so its verdict there depends on the noise; choose another centre, or more "
+            "samples with `verify_spp`"
+        )
+    return is_wrong
+
+
+def _check_center_trials(trials: Sequence[Any]) -> None:
+    """Raise an error if a trial has no verdict: no object in view, or no number."""
     n_hidden = sum(trial.prediction.is_out_of_view for trial in trials)
     if n_hidden:
         raise InputError(
@@ -366,16 +417,6 @@ def find_verdict(verifier: workbench.Verifier, center: Tensor) -> bool:
             f"{CENTER_TRIALS} trials at the centre, so there is no verdict; choose "
             "another centre, or fix the model"
         )
-    n_wrong = sum(trial.success for trial in trials)
-    # True or False, or None if both right and wrong are too frequent for a verdict
-    is_wrong = verifier.problem.verification_rule.decide(n_wrong, CENTER_TRIALS)
-    if is_wrong is None:
-        raise InputError(
-            f"the model is wrong in {n_wrong} of {CENTER_TRIALS} trials at the centre, "
-            "so its verdict there depends on the noise; choose another centre, or more "
-            "samples with `verify_spp`"
-        )
-    return is_wrong
 
 
 def describe_box(
@@ -392,35 +433,63 @@ def describe_box(
         grown: the box.
         varied: the parameters that the box has sides for.
     """
-    low_values = problem.describe(varied.make_configuration(grown.low))
-    high_values = problem.describe(varied.make_configuration(grown.high))
-    center_values = problem.describe(varied.make_configuration(grown.center))
+    corners = (grown.low, grown.high, grown.center)
+    described = [
+        problem.describe(varied.make_configuration(corner)) for corner in corners
+    ]
     sides = []
     for index, name in enumerate(varied.names):
-        described_name = name
-        component = ""
-        if name not in low_values:
-            # It may be a component, such as "camera.target.0" of "camera.target".
-            described_name, _, component = name.rpartition(".")
-        is_described = described_name in low_values
-        if is_described:
-            side = BoxSide(
-                name=name,
-                unit=str(low_values[described_name].get("unit", "")),
-                low=read_described_value(low_values[described_name], component),
-                high=read_described_value(high_values[described_name], component),
-                centre=read_described_value(center_values[described_name], component),
-            )
-        else:
-            side = BoxSide(
-                name=name,
-                unit="of the range",
-                low=float(grown.low[index]),
-                high=float(grown.high[index]),
-                centre=float(grown.center[index]),
-            )
-        sides.append(side)
+        side = _make_described_side(name, *described)
+        sides.append(side or _make_side_of_range(name, grown, index))
     return sides
+
+
+def _make_side_of_range(name: str, grown: boxes.GrownBox, index: int) -> BoxSide:
+    """Make a side of a box whose parameter no control describes.
+
+    Args:
+        name: name of the parameter.
+        grown: the box.
+        index: index of the side.
+    """
+    return BoxSide(
+        name=name,
+        unit="of the range",
+        low=float(grown.low[index]),
+        high=float(grown.high[index]),
+        centre=float(grown.center[index]),
+    )
+
+
+def _make_described_side(
+    name: str,
+    low_values: Mapping[str, Any],
+    high_values: Mapping[str, Any],
+    center_values: Mapping[str, Any],
+) -> BoxSide | None:
+    """Make a side of a box from values that a control describes; None without any.
+
+    Args:
+        name: name of the parameter.
+        low_values: described values at the lower corner.
+        high_values: the same at the upper corner.
+        center_values: the same at the center.
+    """
+    described_name = name
+    component = ""
+    if name not in low_values:
+        # It may be a component, such as "camera.target.0" of "camera.target".
+        described_name, _, component = name.rpartition(".")
+    is_described = described_name in low_values
+    if not is_described:
+        return None
+    return BoxSide(
+        name=name,
+        unit=str(low_values[described_name].get("unit", "")),
+        low=read_described_value(low_values[described_name], component),
+        high=read_described_value(high_values[described_name], component),
+        centre=read_described_value(center_values[described_name], component),
+    )
 
 
 def read_described_value(described: Mapping[str, Any], component: str = "") -> float:
@@ -474,28 +543,37 @@ def _measure_margins(
         size: number of points along each axis.
         varied: the parameters; the first changes along a row.
     """
+    n_points = size * size
     hint = (
-        f"{size * size} pictures of {verifier.run_state.spp} samples a pixel; `map` "
+        f"{n_points} pictures of {verifier.run_state.spp} samples a pixel; `map` "
         "or `verify_spp` shorten it"
     )
-    verifier.progress_stages.begin("map", "drawing the map", size * size, hint=hint)
+    verifier.progress_stages.begin("map", "drawing the map", n_points, hint=hint)
     # coordinates of the points; a single point is at the center of the range
     grid = torch.linspace(0.0, 1.0, size) if size > 1 else torch.tensor([0.5])
-
-    def find_configuration(number: int) -> Tensor:
-        """Return the configuration (d,) of a point."""
-        row, column = divmod(number, size)
-        return varied.make_configuration(torch.stack([grid[column], grid[row]]))
-
     trials = verifier.try_in_batches(
         "map",
-        size * size,
-        find_configuration,
+        n_points,
+        partial(_find_grid_configuration, varied, grid),
         has_success=False,  # no prediction is sought
         predictor=verifier.run_state.predictor,
     )
     margins = [-trial.score for trial in trials]  # a score is a negative margin
     return [margins[begin : begin + size] for begin in range(0, len(margins), size)]
+
+
+def _find_grid_configuration(
+    varied: VariedParameters, grid: Tensor, number: int
+) -> Tensor:
+    """Return the configuration (d,) of a point of a square grid.
+
+    Args:
+        varied: the two parameters.
+        grid: (n,) coordinates of the points along each axis.
+        number: number of the point, counted row by row.
+    """
+    row, column = divmod(number, len(grid))
+    return varied.make_configuration(torch.stack([grid[column], grid[row]]))
 
 
 def find_ranges(

@@ -158,22 +158,24 @@ class RegionResult(views.InNotebook, GrownRegion, results.SceneResult):
         )
 
 
+BOX_COLUMNS: Mapping[str, views.Column] = {
+    "parameter": "{0.name}",
+    "from": "{0.low:.4g}",
+    "to": "{0.high:.4g}",
+    "centre": "{0.centre:.4g}",
+    "unit": "{0.unit}",
+}
+
+
 def make_region_view(result: RegionResult) -> ShownResult:
     """Return the view of a region."""
     if result.box is None or result.interval is None:
         return ShownResult("Stopped before the box was known.")
-    box: Mapping[str, views.Column] = {
-        "parameter": "{0.name}",
-        "from": "{0.low:.4g}",
-        "to": "{0.high:.4g}",
-        "centre": "{0.centre:.4g}",
-        "unit": "{0.unit}",
-    }
     return ShownResult(
         f"The model is {result.verdict} in {result.n_same} of {result.samples} fresh "
         "samples of this box: with 95 % "
         f"confidence in at least {wording.percent(result.interval[0])} of it.",
-        [ResultPart.make_table(result.box, box, title="The box")],
+        [ResultPart.make_table(result.box, BOX_COLUMNS, title="The box")],
         {
             "share of the space": wording.percent(result.volume),
             "samples a pixel": str(result.spp or ""),
@@ -191,23 +193,28 @@ def make_region_claims(result: RegionResult) -> Iterator[views.Claim]:
         or result.verdict is None
     ):
         return
-    description = f"samples that are {result.verdict}"
     extent = results.Extent.from_count(
-        description,
+        f"samples that are {result.verdict}",
         result.n_same,
         result.samples,
         result.interval,
         counts_right=result.verdict == "right",
     )
+    yield views.Claim(
+        kind="measured", statement=_make_statement(result, extent), extent=extent
+    )
+
+
+def _make_statement(result: RegionResult, extent: results.Extent) -> str:
+    """State in how much of which box the verdict stays."""
     sides = [
         f"{side.name} {side.low:.4g} to {side.high:.4g} {side.unit}".strip()
         for side in result.box or ()
     ]
     box = ", ".join(sides) or "the box"
     inside = f"{wording.format_extent(extent)} samples drawn evenly from it"
-    statement = (
+    return (
         f"Inside {box} the model is {result.verdict} in {inside}. Certified by "
         "sampling: single points of it may "
         "differ."
     )
-    yield views.Claim(kind="measured", statement=statement, extent=extent)

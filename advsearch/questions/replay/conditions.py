@@ -22,6 +22,7 @@ from advsearch.extend import (
     Progress,
     RunContext,
     RunDirectory,
+    SceneDescription,
     directory,
     images,
     seeds,
@@ -214,12 +215,7 @@ def resolution_conditions(
 def scene_conditions(problem: Problem, spp: int) -> Iterator[ReplayCondition]:
     """Yield conditions with other light paths, another integrator or sampler."""
     scene = problem.renderer.scene
-    for max_depth in PATH_LENGTHS:
-        if max_depth != scene.max_depth:
-            make_problem = partial(replace_scene_options, problem, max_depth=max_depth)
-            description = f"light paths of {max_depth} segments"
-            yield ReplayCondition("depth", description, make_problem, spp)
-
+    yield from _depth_conditions(problem, spp)
     # Mitsuba's integrator "path" renders no volumes, so that a scene with volumes has
     # no other integrator.
     if not scene.is_volumetric:
@@ -234,6 +230,15 @@ def scene_conditions(problem: Problem, spp: int) -> Iterator[ReplayCondition]:
         sampler = "multijitter"
     make_problem = partial(replace_scene_options, problem, sampler=sampler)
     yield ReplayCondition("sampler", sampler, make_problem, spp)
+
+
+def _depth_conditions(problem: Problem, spp: int) -> Iterator[ReplayCondition]:
+    """Yield conditions with light paths of other lengths than those of the run."""
+    for max_depth in PATH_LENGTHS:
+        if max_depth != problem.renderer.scene.max_depth:
+            make_problem = partial(replace_scene_options, problem, max_depth=max_depth)
+            description = f"light paths of {max_depth} segments"
+            yield ReplayCondition("depth", description, make_problem, spp)
 
 
 def replace_scene_options(problem: Problem, **changes: Any) -> Problem:
@@ -305,24 +310,34 @@ def blender_condition(problem: Problem, spp: int) -> ReplayCondition:
     If Blender is not installed, or the scene cannot be exported, the condition states
     the reason, which the result reports.
     """
-    renderer = problem.renderer
-    description, _reconstruction_filter = renderer.scene.description_and_filter
     # The problem is replaced below, if Cycles can render it.
     condition = ReplayCondition(
         "blender", "Cycles, Blender's renderer", lambda: problem, spp
     )
+    description, _reconstruction_filter = problem.renderer.scene.description_and_filter
     try:
-        cycles = Cycles(
-            description,
-            renderer.formation.resolution,
-            max_depth=renderer.scene.max_depth,
-            denoise=renderer.formation.denoiser != "none",
-        )
+        cycles = _make_cycles(problem, description)
     except BlenderError as error:
         return replace(condition, unavailable_reason=str(error))
     # `source` is the function that renders the radiance.
     make_problem = partial(replace_renderer_options, problem, source=cycles.radiance)
     return replace(condition, make_problem=make_problem)
+
+
+def _make_cycles(problem: Problem, description: SceneDescription) -> Cycles:
+    """Make the renderer with Cycles of a problem's images.
+
+    Args:
+        problem: the problem.
+        description: the scene of the problem.
+    """
+    renderer = problem.renderer
+    return Cycles(
+        description,
+        renderer.formation.resolution,
+        max_depth=renderer.scene.max_depth,
+        denoise=renderer.formation.denoiser != "none",
+    )
 
 
 def model_condition(
@@ -347,15 +362,11 @@ def model_condition(
     if takes_same_images:
         shared_key = RUN_RENDERS
         other_problem = replace(other_problem, renderer=problem.renderer)
-
-    def make_problem() -> Problem:
-        """Return a copy of the problem, since each condition needs its own one."""
-        return replace(other_problem)
-
     return ReplayCondition(
         "model",
         name,
-        make_problem=make_problem,
+        # a copy of the problem, since each condition needs its own one
+        make_problem=partial(replace, other_problem),
         spp=spp,
         radiance_key=shared_key,
         image_key=shared_key,
@@ -433,15 +444,10 @@ def replay(
     parts = None
     python_only = list[settings.PythonOnly]()
     if isinstance(attack, AttackResult):
-        if attack.run is None:
-            raise InputError(
-                "attack: expected an attack whose run is stored, got one that "
-                "is not; set its `run`"
-            )
-        run = attack.run
+        run = _get_stored_run(attack)
         # Parts that exist only in Python, such as a model object, cannot be loaded from
         # the run. `attack.parts` is a function that returns them.
-        python_only = _read_python_only_parts(Path(run))
+        python_only = _read_python_only_parts(run)
         if attack.parts is not None:
             parts = attack.parts()
     config = workbench.make_config(ReplayConfig, attack=run, **options)
@@ -451,6 +457,20 @@ def replay(
         config, progress=workbench.as_progress(progress), parts=parts
     )
     return result
+
+
+def _get_stored_run(attack: AttackResult) -> Path:
+    """Return the directory of an attack's run.
+
+    Raises:
+        InputError: the run is not stored.
+    """
+    if attack.run is None:
+        raise InputError(
+            "attack: expected an attack whose run is stored, got one that "
+            "is not; set its `run`"
+        )
+    return Path(attack.run)
 
 
 def _read_python_only_parts(run: Path) -> list[settings.PythonOnly]:
@@ -488,51 +508,116 @@ def run_replay(
     """
     config = context.config
     context.progress.stage(workbench.LOADING)
-    attack_directory = directory.find_run(config.attack)
-    attack = _load_attack(attack_directory)
-    # `RUN_MODEL` stands for the run's own model, which is always used.
-    settings.check_no_duplicates((RUN_MODEL, *config.models), "model")
-    parts = parts or workbench.load_parts_of_run(attack_directory)
-    # a change of the setting `threads`; empty to use as many as the run
-    threads = {} if config.threads is None else {"threads": config.threads}
-    load_problem = partial(workbench.make_problem_with_warnings, parts, **threads)
-    problem, warnings = load_problem()
-    warnings += describe_changed_file(attack_directory, parts)
-
-    spp = verification_spp(attack)
-    conditions = select_conditions(config, problem, spp, load_problem)
+    attack = _load_replayed_attack(config, parts)
+    problem, warnings = attack.load_problem()
+    warnings += describe_changed_file(attack.directory, attack.parts)
+    spp = verification_spp(attack.summary)
+    conditions = select_conditions(config, problem, spp, attack.load_problem)
     if config.backdrop is not None:
-        conditions += photograph_conditions(parts, config.backdrop, spp, threads)
-    table = _Table(
-        u=workbench.read_stored_configuration(attack_directory, problem),
-        trials=config.trials,
-        # another stream of seeds, so that no noise of the attack is repeated
-        seed=seeds.derive_seed(parts.config.seed, "replay"),
-        run=context.run,
-        progress=context.progress,
-    )
-    with context.until_interrupted():
-        # Conditions that share renders are in the same batch, so that each image is
-        # rendered once.
-        for batch in batch_by_renders(conditions, spp):
-            table.add_rows(batch)
+        conditions += photograph_conditions(
+            attack.parts, config.backdrop, spp, attack.threads
+        )
+    u = workbench.read_stored_configuration(attack.directory, problem)
+    # Conditions that share renders are in the same batch, so that each image is
+    # rendered once.
+    batches = batch_by_renders(conditions, spp)
+    table = _fill_table(context, u, attack.parts.config.seed, batches)
     rows = table.list_rows(conditions)
     return context.result(
         ReplayResult,
-        adversarial_run=str(attack_directory),
-        run_ending=attack.ending,
-        object=attack.object,
-        model=attack.model,
-        task=attack.task,
-        environment=attack.environment,
-        controls=attack.controls,
+        adversarial_run=str(attack.directory),
+        **_list_attack_facts(attack.summary),
         table=rows,
         transfer=count_transfer(rows, PHOTOGRAPH),
         searched=count_transfer(rows, SEARCHED_PHOTOGRAPH),
         renders=table.renders,
         warnings=warnings,
-        seed=parts.config.seed,
+        seed=attack.parts.config.seed,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _ReplayedAttack:
+    """An attack whose adversarial scene is rendered again.
+
+    Attributes:
+        directory: directory of its run.
+        summary: its summary.
+        parts: its loaded parts.
+        threads: a change of the setting `threads`; empty to use as many as the run.
+    """
+
+    directory: Path
+    summary: workbench.AttackSummary
+    parts: workbench.AttackParts
+    threads: dict[str, Any]
+
+    def load_problem(self, **changes: Any) -> tuple[Problem, list[str]]:
+        """Load its problem, with changes to its settings, and warnings about it."""
+        return workbench.make_problem_with_warnings(
+            self.parts, **{**self.threads, **changes}
+        )
+
+
+def _load_replayed_attack(
+    config: ReplayConfig, parts: workbench.AttackParts | None
+) -> _ReplayedAttack:
+    """Load the attack that the settings name, and check that it can be replayed.
+
+    Args:
+        config: the settings.
+        parts: its loaded parts; None to load what its run names.
+    """
+    attack_directory = directory.find_run(config.attack)
+    summary = _load_attack(attack_directory)
+    # `RUN_MODEL` stands for the run's own model, which is always used.
+    settings.check_no_duplicates((RUN_MODEL, *config.models), "model")
+    return _ReplayedAttack(
+        directory=attack_directory,
+        summary=summary,
+        parts=parts or workbench.load_parts_of_run(attack_directory),
+        threads={} if config.threads is None else {"threads": config.threads},
+    )
+
+
+def _fill_table(
+    context: RunContext[ReplayConfig],
+    u: Tensor,
+    attack_seed: int,
+    batches: Sequence[Sequence[ReplayCondition]],
+) -> _Table:
+    """Render batches of conditions until an interrupt, and return their rows.
+
+    Args:
+        context: the settings and the run.
+        u: the adversarial configuration (d,).
+        attack_seed: seed of the attack.
+        batches: conditions that share their renders.
+    """
+    table = _Table(
+        u=u,
+        trials=context.config.trials,
+        # another stream of seeds, so that no noise of the attack is repeated
+        seed=seeds.derive_seed(attack_seed, "replay"),
+        run=context.run,
+        progress=context.progress,
+    )
+    with context.until_interrupted():
+        for batch in batches:
+            table.add_rows(batch)
+    return table
+
+
+def _list_attack_facts(attack: workbench.AttackSummary) -> dict[str, Any]:
+    """Return what a replay's result states about its attack, by field."""
+    return {
+        "run_ending": attack.ending,
+        "object": attack.object,
+        "model": attack.model,
+        "task": attack.task,
+        "environment": attack.environment,
+        "controls": attack.controls,
+    }
 
 
 def _load_attack(attack_directory: Path) -> workbench.AttackSummary:
@@ -576,12 +661,7 @@ def select_conditions(
         spp: samples per pixel of the run's verification.
         load_problem: loads the problem again, with changes to its settings.
     """
-
-    def resize(size: tuple[int, int]) -> Problem:
-        """Load the problem at another resolution, without its warnings."""
-        resized_problem, _ = load_problem(resolution=size)
-        return resized_problem
-
+    resize = partial(_load_resized, load_problem)
     unchanged, *other_conditions = list_conditions(problem, spp, resize)
     conditions = [unchanged]
     conditions += [
@@ -594,6 +674,19 @@ def select_conditions(
         other_problem, _ = load_problem(model=model_name, ensemble=None)
         conditions.append(model_condition(problem, other_problem, model_name, spp))
     return conditions
+
+
+def _load_resized(
+    load_problem: Callable[..., tuple[Problem, list[str]]], size: tuple[int, int]
+) -> Problem:
+    """Load the problem at another resolution, without its warnings.
+
+    Args:
+        load_problem: loads the problem again, with changes to its settings.
+        size: (height, width) in pixels.
+    """
+    resized_problem, _ = load_problem(resolution=size)
+    return resized_problem
 
 
 def batch_by_renders(
@@ -693,14 +786,7 @@ class _Table:
         Args:
             conditions: conditions that share their renders.
         """
-        names = ", ".join(dict.fromkeys(condition.name for condition in conditions))
-        if len(conditions) == 1:
-            names = f"{names}: {conditions[0].description}"
-        self.progress.stage(
-            f"replaying, {names}",
-            2 * self.trials * len(conditions),
-            hint="`trials` or `ways` shorten it",
-        )
+        self._begin_replaying(conditions)
         retrial_of_condition = {
             condition: condition.to_retrial() for condition in conditions
         }
@@ -717,6 +803,17 @@ class _Table:
             renders_after = sum(renderer.n_renders for renderer in renderers)
             self.renders += renders_after - renders_before
 
+    def _begin_replaying(self, conditions: Sequence[ReplayCondition]) -> None:
+        """Begin the stage of conditions that share their renders."""
+        names = ", ".join(dict.fromkeys(condition.name for condition in conditions))
+        if len(conditions) == 1:
+            names = f"{names}: {conditions[0].description}"
+        self.progress.stage(
+            f"replaying, {names}",
+            2 * self.trials * len(conditions),
+            hint="`trials` or `ways` shorten it",
+        )
+
     def _add_trials(
         self, retrial_of_condition: Mapping[ReplayCondition, workbench.RetrialCondition]
     ) -> None:
@@ -727,13 +824,7 @@ class _Table:
         Args:
             retrial_of_condition: each condition in the form that `Retrials` takes.
         """
-        retrials = workbench.Retrials(
-            list(retrial_of_condition.values()),
-            self.run,
-            self.progress,
-            trials=self.trials,
-            seed=self.seed,
-        )
+        retrials = self._make_retrials(list(retrial_of_condition.values()))
         clean_results = {
             condition: workbench.make_control_group(
                 retrials.run_clean_trials(retrial), retrial.spp
@@ -750,6 +841,14 @@ class _Table:
                 clean=clean_results[condition],
                 verified=workbench.make_verified_rate(verification),
             )
+
+    def _make_retrials(
+        self, conditions: list[workbench.RetrialCondition]
+    ) -> workbench.Retrials:
+        """Make what tries scenes again under some conditions."""
+        return workbench.Retrials(
+            conditions, self.run, self.progress, trials=self.trials, seed=self.seed
+        )
 
 
 def describe_changed_file(path: Path, parts: workbench.AttackParts) -> list[str]:

@@ -221,19 +221,8 @@ class Cycles:
             BlenderError: Blender is not installed, or the scene has something that
                 cannot be exported to Blender.
         """
-        try:
-            self._command = workbench.find_blender(
-                "Blender's Cycles has to render it", "leave `ways=blender` out"
-            )
-        except errors.FileFormatError as error:
-            raise BlenderError(str(error)) from None
-        unsupported = _find_unsupported(description)
-        if unsupported:
-            raise BlenderError(
-                # Five names are enough for a message.
-                f"the scene has {', '.join(unsupported[:5])}, which is not "
-                "carried over to Blender"
-            )
+        self._command = _find_blender_command()
+        _check_supported(description)
         self._description = description
         self._resolution = size
         self._depth = max_depth
@@ -279,14 +268,7 @@ class Cycles:
         values = {name: value.detach().cpu() for name, value in inputs.items()}
         meshes = [workbench.pose_mesh(part, values) for part in scene.meshes.values()]
         meshes += _make_ground(scene, values.get("ground.reflectance"))
-        radiance = None
-        if scene.environment is not None:
-            radiance = np.asarray(scene.environment.radiance, np.float32)
-        if "environment.padded" in values:
-            # An environment map that is searched has an additional column at each side,
-            # so that interpolation wraps around. These two columns are removed.
-            radiance = values["environment.padded"][:, 1:-1].numpy()
-
+        radiance = _get_radiance(scene, values)
         blender_settings = self._make_settings(
             values, width, height, has_environment=radiance is not None
         )
@@ -357,6 +339,39 @@ class Cycles:
         }
 
 
+def _find_blender_command() -> list[str]:
+    """Return the command that runs a script in Blender.
+
+    Raises:
+        BlenderError: Blender is not installed.
+    """
+    try:
+        return workbench.find_blender(
+            "Blender's Cycles has to render it", "leave `ways=blender` out"
+        )
+    except errors.FileFormatError as error:
+        raise BlenderError(str(error)) from None
+
+
+def _get_radiance(
+    scene: SceneDescription, values: Mapping[str, Tensor]
+) -> np.ndarray | None:
+    """Return the radiance (H, W, 3) of the environment map; None without one.
+
+    Args:
+        scene: the scene.
+        values: the scene's inputs by name.
+    """
+    radiance = None
+    if scene.environment is not None:
+        radiance = np.asarray(scene.environment.radiance, np.float32)
+    if "environment.padded" in values:
+        # An environment map that is searched has an additional column at each side,
+        # so that interpolation wraps around. These two columns are removed.
+        radiance = values["environment.padded"][:, 1:-1].numpy()
+    return radiance
+
+
 def _get_number(values: Mapping[str, Tensor], name: str, default: float) -> float:
     """Return the number in an input of a scene (1,), in float32.
 
@@ -366,6 +381,17 @@ def _get_number(values: Mapping[str, Tensor], name: str, default: float) -> floa
         default: the number if there is no such input.
     """
     return float(values.get(name, torch.tensor([default]))[0])
+
+
+def _check_supported(description: SceneDescription) -> None:
+    """Raise an error if a scene has parts that cannot be transferred to Blender."""
+    unsupported = _find_unsupported(description)
+    if unsupported:
+        raise BlenderError(
+            # Five names are enough for a message.
+            f"the scene has {', '.join(unsupported[:5])}, which is not "
+            "carried over to Blender"
+        )
 
 
 def _find_unsupported(description: SceneDescription) -> list[str]:
@@ -399,27 +425,40 @@ def _describe_lamps(
         scene: the scene.
         values: the scene's inputs by name; missing ones have the values of the scene.
     """
-    lamps: list[dict[str, object]] = []
+    lamps = []
     for lamp in scene.lamps.values():
-        to_world = np.eye(4)
-        ball: list[list[float]] | None = None
         if isinstance(lamp, parts.BallLamp):
-            default_ball = torch.from_numpy(
-                assets.make_pose(lamp.radius * np.eye(3), lamp.center)
-            )
-            ball = values.get(f"{lamp.name}.ball", default_ball).double().tolist()
-            color = values.get(f"{lamp.name}.radiance", torch.tensor(lamp.radiance))
+            described, color = _describe_ball(lamp, values)
         else:
             assert isinstance(lamp, parts.PointLamp)  # see `_find_unsupported`
-            position = values.get(f"{lamp.name}.position", torch.tensor(lamp.position))
-            to_world[:3, 3] = position.numpy()
-            color = values.get(f"{lamp.name}.intensity", torch.tensor(lamp.intensity))
+            described, color = _describe_point(lamp, values)
         is_on = bool((color > 0.0).any())
         if is_on:
-            lamps.append(
-                {"ball": ball, "to_world": to_world.tolist(), "color": color.tolist()}
-            )
+            lamps.append({**described, "color": color.tolist()})
     return lamps
+
+
+def _describe_ball(
+    lamp: parts.BallLamp, values: Mapping[str, Tensor]
+) -> tuple[dict[str, object], Tensor]:
+    """Return pose and radiance (3,) of a spherical lamp; see `_describe_lamps`."""
+    default_ball = torch.from_numpy(
+        assets.make_pose(lamp.radius * np.eye(3), lamp.center)
+    )
+    ball = values.get(f"{lamp.name}.ball", default_ball).double().tolist()
+    color = values.get(f"{lamp.name}.radiance", torch.tensor(lamp.radiance))
+    return {"ball": ball, "to_world": np.eye(4).tolist()}, color
+
+
+def _describe_point(
+    lamp: parts.PointLamp, values: Mapping[str, Tensor]
+) -> tuple[dict[str, object], Tensor]:
+    """Return position and intensity (3,) of a point lamp; see `_describe_lamps`."""
+    to_world = np.eye(4)
+    position = values.get(f"{lamp.name}.position", torch.tensor(lamp.position))
+    to_world[:3, 3] = position.numpy()
+    color = values.get(f"{lamp.name}.intensity", torch.tensor(lamp.intensity))
+    return {"ball": None, "to_world": to_world.tolist()}, color
 
 
 def _turn_for_blender(shape: assets.Shape) -> assets.Shape:
@@ -465,15 +504,19 @@ def _make_ground(
     has_plain_ground = half_size > 0.0 and not workbench.is_paved(scene)
     if not has_plain_ground:
         return []
+    # one texel of the color of the ground, which is in sRGB already
+    texture = np.full((1, 1, 3), scene.ground_color, np.float32)
+    return [assets.Shape("ground", _make_square(half_size), texture, MATT)]
+
+
+def _make_square(half_size: np.float32) -> assets.Mesh:
+    """Return a horizontal square around the origin, by half the length of its side."""
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
     normals = np.tile(np.array([[0, 0, 1]], np.float32), (4, 1))
     # from 0 to 1 where the corners are at -1 and 1
     texture_coordinates = corners[:, :2] * np.float32(0.5) + np.float32(0.5)
-    mesh = assets.Mesh(corners * half_size, faces, normals, texture_coordinates)
-    # one texel of the color of the ground, which is in sRGB already
-    texture = np.full((1, 1, 3), scene.ground_color, np.float32)
-    return [assets.Shape("ground", mesh, texture, MATT)]
+    return assets.Mesh(corners * half_size, faces, normals, texture_coordinates)
 
 
 class _Process:
@@ -576,36 +619,49 @@ class _Process:
         Raises:
             BlenderError: Blender stopped, or took too long.
         """
-        self._n_images += 1
-        path = self._directory / f"{self._n_images}.exr"
         time_limit = stored_files.scale_limit(MAX_RENDER_SECONDS)
         deadline = time.monotonic() + time_limit
-        assert self._process.stdin is not None
-        try:
-            self._process.stdin.write(f"{seed} {spp} {self._n_images}\n".encode())
-            self._process.stdin.flush()
-        except OSError:
-            pass  # Blender has stopped, which is reported below
+        path = self._request_image(seed, spp)
         # Blender writes the file under its final name when it is complete.
         while not path.is_file():
-            has_stopped = self._process.poll() is not None
-            # Blender may have written the file just before it stopped.
-            if has_stopped and not path.is_file():
-                log = self._log.read_text("utf-8", "replace")
-                raise BlenderError(f"Blender stopped{workbench.get_last_line(log)}")
+            self._check_running(path)
             if time.monotonic() > deadline:
                 raise BlenderError(
                     f"Blender had not rendered it after {time_limit} seconds"
                 )
             time.sleep(POLL_INTERVAL)
-        with OpenEXR.File(str(path)) as image:
-            channels = image.channels().values()
-            # There is one layer, whose name Blender chooses. It has RGB, perhaps with
-            # alpha.
-            pixels = next(iter(channels)).pixels
-            radiance = torch.from_numpy(np.array(pixels[..., :3], dtype=np.float32))
+        radiance = _read_radiance(path)
         path.unlink()
         return radiance
+
+    def _request_image(self, seed: int, spp: int) -> Path:
+        """Tell Blender to render an image, and return the path that it will write."""
+        self._n_images += 1
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(f"{seed} {spp} {self._n_images}\n".encode())
+            self._process.stdin.flush()
+        except OSError:
+            pass  # Blender has stopped, which `_check_running` reports
+        return self._directory / f"{self._n_images}.exr"
+
+    def _check_running(self, path: Path) -> None:
+        """Raise an error if Blender has stopped before it has written an image."""
+        has_stopped = self._process.poll() is not None
+        # Blender may have written the file just before it stopped.
+        if has_stopped and not path.is_file():
+            log = self._log.read_text("utf-8", "replace")
+            raise BlenderError(f"Blender stopped{workbench.get_last_line(log)}")
+
+
+def _read_radiance(path: Path) -> Tensor:
+    """Read the image (H, W, 3) that Blender has written, linear."""
+    with OpenEXR.File(str(path)) as image:
+        channels = image.channels().values()
+        # There is one layer, whose name Blender chooses. It has RGB, perhaps with
+        # alpha.
+        pixels = next(iter(channels)).pixels
+        return torch.from_numpy(np.array(pixels[..., :3], dtype=np.float32))
 
 
 def _stop(

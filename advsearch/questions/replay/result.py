@@ -261,18 +261,25 @@ def count_transfer(
         return None
     n_clean_right = sum(row.ending != CLEAN_IS_WRONG for row in rows)
     n_holding = sum(row.ending == HOLDS for row in rows)
-    rate = None
-    if n_clean_right:
-        rate = results.Estimate(
-            value=n_holding / n_clean_right,
-            interval=statistics.intervals.clopper_pearson(n_holding, n_clean_right),
-        )
     return PhotographTransfer(
         photographs=len(rows),
         clean_right=n_clean_right,
         holding=n_holding,
-        rate=rate,
+        rate=_estimate_holding_rate(n_holding, n_clean_right),
     )
+
+
+def _estimate_holding_rate(
+    n_holding: int, n_clean_right: int
+) -> results.Estimate | None:
+    """Estimate the fraction of photographs in which a scene holds.
+
+    It is among those in which the model is right for the clean scene; None without any.
+    """
+    if not n_clean_right:
+        return None
+    interval = statistics.intervals.clopper_pearson(n_holding, n_clean_right)
+    return results.Estimate(value=n_holding / n_clean_right, interval=interval)
 
 
 def describe_transfer(transfer: PhotographTransfer, kind: str = "other") -> str:
@@ -341,15 +348,21 @@ def make_replay_claims(result: ReplayResult) -> Iterator[views.Claim]:
             name += f": {row.condition}"
         yield views.Claim.from_case(name, row.ending, row.verified)
     transfer = result.transfer
-    if transfer is None or transfer.rate is None:
-        return
+    if transfer is not None and transfer.rate is not None:
+        yield _make_transfer_claim(transfer, transfer.rate)
+
+
+def _make_transfer_claim(
+    transfer: PhotographTransfer, rate: results.Estimate
+) -> views.Claim:
+    """Make the claim over the photographs, with its rate and interval."""
     extent = results.Extent.from_count(
         "photographs in which the clean scene is right and the adversarial one holds",
         transfer.holding,
         transfer.clean_right,
-        transfer.rate.interval,
+        rate.interval,
     )
-    yield views.Claim(
+    return views.Claim(
         kind="measured", statement=describe_transfer(transfer), extent=extent
     )
 
@@ -366,27 +379,40 @@ def summarize_replay(result: ReplayResult) -> str:
         if row.ending != NOT_DONE
         and row.change not in (PHOTOGRAPH, SEARCHED_PHOTOGRAPH)
     ]
-    text = f"As verified, the adversarial scene {_describe_unchanged(unchanged)}"
     has_photographs = result.transfer is not None or result.searched is not None
-    if changed:
-        n_holding = sum(row.ending == HOLDS for row in changed)
-        text += f"; changed, it holds under {n_holding} of {len(changed)} conditions"
-    elif not has_photographs:
-        text += "; no change was rendered"
-    text += "."
+    text = f"As verified, the adversarial scene {_describe_unchanged(unchanged)}"
+    text += f"{_describe_changes(changed, has_photographs)}."
     # other photographs than those of the search; then those of the search
     if result.transfer is not None:
         text += f" {describe_transfer(result.transfer)}"
     if result.searched is not None:
         text += f" {describe_transfer(result.searched, 'searched')}"
+    return text + _describe_clean_failures(changed)
+
+
+def _describe_changes(changed: Sequence[ReplayRow], has_photographs: bool) -> str:
+    """Return under how many changed conditions the scene holds, to end a sentence.
+
+    Args:
+        changed: rows of the conditions that were rendered, without photographs.
+        has_photographs: whether photographs were rendered, which other sentences count.
+    """
+    if changed:
+        n_holding = sum(row.ending == HOLDS for row in changed)
+        return f"; changed, it holds under {n_holding} of {len(changed)} conditions"
+    return "" if has_photographs else "; no change was rendered"
+
+
+def _describe_clean_failures(changed: Sequence[ReplayRow]) -> str:
+    """Return a sentence on conditions where the clean scene is wrong; "" without any."""
     clean_wrong = [row for row in changed if row.ending == CLEAN_IS_WRONG]
-    if clean_wrong:
-        names = ", ".join(f"{row.change}: {row.condition}" for row in clean_wrong)
-        text += (
-            f" The model is wrong for the clean scene, too, under {names}: these "
-            "conditions show nothing about the adversarial scene."
-        )
-    return text
+    if not clean_wrong:
+        return ""
+    names = ", ".join(f"{row.change}: {row.condition}" for row in clean_wrong)
+    return (
+        f" The model is wrong for the clean scene, too, under {names}: these "
+        "conditions show nothing about the adversarial scene."
+    )
 
 
 def _describe_unchanged(row: ReplayRow) -> str:

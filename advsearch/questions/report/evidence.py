@@ -13,7 +13,7 @@ from contextlib import suppress
 from datetime import datetime, timezone
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard, cast
+from typing import Any, NamedTuple, TypeGuard, cast
 
 from advsearch.extend import (
     InputError,
@@ -42,10 +42,6 @@ from advsearch.questions.report.recorded import (
     read_run_settings,
 )
 from advsearch.questions.report.result import ConditionShare, Evidence, EvidenceRun
-
-if TYPE_CHECKING:
-    from advsearch.extend import workbench
-
 
 DRIVES_PART = "ways and speeds"
 THINGS_PART = "road users and things"
@@ -115,18 +111,28 @@ def count_conditions(
     conditions = []
     for row in result.axes:
         if photographs is None:
-            right = row.correct
-            total = row.configurations
-            # A single image has no interval, so nothing is known of the fraction.
-            interval = row.interval or UNKNOWN_FRACTION
+            condition = _count_renderings(row)
         else:
-            right, total = _count_agreeing(photographs, row.axis, row.value)
-            interval = UNKNOWN_FRACTION
-            if total:
-                interval = statistics.intervals.clopper_pearson(right, total)
-        if total:
-            conditions.append(_make_condition(row, right, total, interval))
+            condition = _count_photographs(row, photographs)
+        if condition.total:
+            conditions.append(condition)
     return conditions
+
+
+def _count_renderings(row: Any) -> ConditionShare:
+    """Count right predictions about renderings with one value of an axis."""
+    # A single image has no interval, so nothing is known of the fraction.
+    interval = row.interval or UNKNOWN_FRACTION
+    return _make_condition(row, row.correct, row.configurations, interval)
+
+
+def _count_photographs(row: Any, photographs: Sequence[Any]) -> ConditionShare:
+    """Count photographs with one value of an axis that agree with their rendering."""
+    n_agreeing, total = _count_agreeing(photographs, row.axis, row.value)
+    interval = UNKNOWN_FRACTION
+    if total:
+        interval = statistics.intervals.clopper_pearson(n_agreeing, total)
+    return _make_condition(row, n_agreeing, total, interval)
 
 
 def _make_condition(
@@ -256,6 +262,19 @@ def describe_criterion(
         lines = [_count_verdicts(verdict_of_condition, criterion, selected_axes)]
     else:
         lines = _describe_criterion_of_claims(claims, criterion, selected_axes)
+    return lines + _list_by_verdict(verdict_of_condition, listed_verdicts)
+
+
+def _list_by_verdict(
+    verdict_of_condition: Mapping[str, str], listed_verdicts: Sequence[str]
+) -> list[str]:
+    """Return a sentence for each verdict that some conditions have, with their names.
+
+    Args:
+        verdict_of_condition: "met", "not met" or "open" for each condition.
+        listed_verdicts: the verdicts to list.
+    """
+    lines = []
     for listed in listed_verdicts:
         names = [
             condition
@@ -305,19 +324,23 @@ def _describe_criterion_of_claims(
             f" Over the values of {', '.join(selected_axes)} that were chosen: others "
             "give another share."
         )
-    lines = []
-    for claim in claims:
-        extent = claim.extent
-        # `extent` has the counted numbers of a claim; None if it counts nothing. A
-        # criterion is about right predictions, not about failures.
-        if extent is not None and extent.counts_right:
-            verdict = evaluate_criterion(criterion, extent.interval)
-            lines.append(
-                f"At least {wording.percent(criterion)}: "
-                f"{verdict} by {extent.count} of {extent.total} {extent.what}, "
-                f"95 % interval {wording.format_interval(extent.interval)}.{remark}"
-            )
-    return lines
+    # `extent` has the counted numbers of a claim; None if it counts nothing. A
+    # criterion is about right predictions, not about failures.
+    return [
+        f"{_describe_claim_verdict(claim.extent, criterion)}{remark}"
+        for claim in claims
+        if claim.extent is not None and claim.extent.counts_right
+    ]
+
+
+def _describe_claim_verdict(extent: results.Extent, criterion: float) -> str:
+    """Describe whether a claimed fraction of right predictions meets a criterion."""
+    verdict = evaluate_criterion(criterion, extent.interval)
+    return (
+        f"At least {wording.percent(criterion)}: "
+        f"{verdict} by {extent.count} of {extent.total} {extent.what}, "
+        f"95 % interval {wording.format_interval(extent.interval)}."
+    )
 
 
 def read_exposure(path: str) -> dict[str, dict[str, float]]:
@@ -331,21 +354,32 @@ def read_exposure(path: str) -> dict[str, dict[str, float]]:
     exposure: dict[str, dict[str, float]] = {}
     for axis, weights in settings.read_yaml(path).items():
         where = f"exposure: {path}: {axis}"
-        if not isinstance(weights, Mapping) or not weights:
-            raise InputError(
-                f"{where}: expected values with a weight each, such as {{street: 0.8}}"
-            )
-        for value, weight in weights.items():
-            if not _is_weight(weight):
-                raise InputError(
-                    f"{where}: {value}: expected a number of at least 0, got {weight!r}"
-                )
-        exposure[str(axis)] = {
-            str(value): float(weight) for value, weight in weights.items()
-        }
+        exposure[str(axis)] = _read_axis_weights(weights, where)
         if sum(exposure[str(axis)].values()) <= 0.0:
             raise InputError(f"{where}: expected a weight over 0")
     return exposure
+
+
+def _read_axis_weights(weights: object, where: str) -> dict[str, float]:
+    """Return the weights of the values of one axis.
+
+    Args:
+        weights: the weights as the YAML file states them.
+        where: file and axis, for messages.
+
+    Raises:
+        InputError: they are no values with a weight each.
+    """
+    if not isinstance(weights, Mapping) or not weights:
+        raise InputError(
+            f"{where}: expected values with a weight each, such as {{street: 0.8}}"
+        )
+    for value, weight in weights.items():
+        if not _is_weight(weight):
+            raise InputError(
+                f"{where}: {value}: expected a number of at least 0, got {weight!r}"
+            )
+    return {str(value): float(weight) for value, weight in weights.items()}
 
 
 def _is_weight(value: Any) -> bool:
@@ -355,6 +389,12 @@ def _is_weight(value: Any) -> bool:
     """
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     return is_number and bool(0.0 <= value <= 1e9)
+
+
+DEPENDENT_PREDICTIONS = (
+    "Weighted by {axis}: not computed, as predictions are not independent (frames of a "
+    "drive are not)."
+)
 
 
 def describe_exposure(
@@ -385,19 +425,23 @@ def describe_exposure(
         if not rows:
             # The run does not vary this axis.
             continue
-        for value in weights:
-            if value not in rows:
-                raise errors.UnknownNameError(
-                    f"value of {axis} in the exposure", value, rows
-                )
+        _check_weighted_values(axis, weights, rows)
         if is_independent:
             lines.append(_describe_weighted(axis, rows, weights))
         else:
-            lines.append(
-                f"Weighted by {axis}: not computed, as predictions are not independent "
-                "(frames of a drive are not)."
-            )
+            lines.append(DEPENDENT_PREDICTIONS.format(axis=axis))
     return lines
+
+
+def _check_weighted_values(
+    axis: str, weights: Mapping[str, float], rows: Mapping[str, ConditionShare]
+) -> None:
+    """Raise an error if the exposure weights a value that an axis does not have."""
+    for value in weights:
+        if value not in rows:
+            raise errors.UnknownNameError(
+                f"value of {axis} in the exposure", value, rows
+            )
 
 
 def _describe_weighted(
@@ -447,12 +491,12 @@ def _compute_weighted_mean(
     for value, weight in weights.items():
         row = rows[value]
         fraction = weight / total
-        interval = statistics.intervals.clopper_pearson(
+        lower_bound, upper_bound = statistics.intervals.clopper_pearson(
             row.right, row.total, confidence
         )
         mean = mean + fraction * row.right / row.total
-        lower = lower + fraction * interval[0]
-        upper = upper + fraction * interval[1]
+        lower = lower + fraction * lower_bound
+        upper = upper + fraction * upper_bound
     return mean, lower, upper
 
 
@@ -496,16 +540,9 @@ def describe_domain(
         searched: sentences about what varied, from `describe_searched`.
     """
     fixed = _describe_fixed(result, recorded)
-    # `over` are the controls that vary at random in an attack. Not every result has
-    # these fields.
-    controls = [*getattr(result, "controls", ()), *getattr(result, "over", ())]
     domain = dict[str, DomainPart]()
     for part in (*DOMAIN, OTHER):
-        varied = [line for line in searched if find_domain_part(line) == part]
-        if not varied:
-            varied = [name for name in controls if find_domain_part(name) == part]
-        if part == DRIVES_PART:
-            varied += _describe_drives(result)
+        varied = _list_varied(part, result, searched)
         fixed_text = "; ".join(filter(None, fixed[part]))
         if varied:
             domain[part] = DomainPart(Variation.VARIED, "; ".join(varied))
@@ -513,10 +550,36 @@ def describe_domain(
             domain[part] = DomainPart(Variation.FIXED, fixed_text)
     if domain["place"].variation is Variation.VARIED:
         for part in ("light", "weather"):
-            description = domain[part].description
-            if domain[part].variation is Variation.FIXED:
-                domain[part] = DomainPart(Variation.WITH_ENVIRONMENT, description)
+            domain[part] = _tie_to_environment(domain[part])
     return domain
+
+
+def _tie_to_environment(part: DomainPart) -> DomainPart:
+    """Return a fixed part as one that each environment has; a varied part as it is."""
+    if part.variation is Variation.FIXED:
+        return DomainPart(Variation.WITH_ENVIRONMENT, part.description)
+    return part
+
+
+def _list_varied(
+    part: str, result: results.Result, searched: Sequence[str]
+) -> list[str]:
+    """Return what varied in a part of the domain: sentences, or names of controls.
+
+    Args:
+        part: name of the part.
+        result: result of the run.
+        searched: sentences about what varied.
+    """
+    varied = [line for line in searched if find_domain_part(line) == part]
+    if not varied:
+        # `over` are the controls that vary at random in an attack. Not every result has
+        # these fields.
+        controls = [*getattr(result, "controls", ()), *getattr(result, "over", ())]
+        varied = [name for name in controls if find_domain_part(name) == part]
+    if part == DRIVES_PART:
+        varied += _describe_drives(result)
+    return varied
 
 
 def _describe_drives(result: results.Result) -> list[str]:
@@ -552,6 +615,15 @@ def _describe_fixed(
     fixed[THINGS_PART].append("; ".join(filter(None, things)))
     fixed[CAMERA_PART].append(join_setting_values(recorded, "camera"))
     fixed[CAMERA_PART].append(join_setting_values(recorded, "backdrop"))
+    for name, value in _list_fixed_parameters(recorded):
+        fixed[find_domain_part(name)].append(f"{name} {value}")
+    return fixed
+
+
+def _list_fixed_parameters(
+    recorded: Sequence[RecordedSettings],
+) -> list[tuple[str, str]]:
+    """Return the parameters that settings fix, as (name, value), each pair once."""
     # The setting `set` has fixed values of parameters by name. The keys of this dict
     # are a set that keeps the order, so that each pair is listed once.
     parameters = dict[tuple[str, str], None]()
@@ -560,9 +632,7 @@ def _describe_fixed(
         if isinstance(fixed_values, Mapping):
             for name, value in fixed_values.items():
                 parameters[str(name), str(value)] = None
-    for name, value in parameters:
-        fixed[find_domain_part(name)].append(f"{name} {value}")
-    return fixed
+    return list(parameters)
 
 
 def find_domain_part(name: str) -> str:
@@ -607,11 +677,7 @@ QUICK = (
 def collect_claims(result: results.Result) -> list[views.Claim]:
     """Return the claims of a run; if it has none, a claim that states the reason."""
     if result.is_unfinished:
-        is_running = getattr(result, "ending", "") == results.RUNNING
-        reason = "the run is running" if is_running else "the run is not finished"
-        if result.outcome_summary:
-            reason += f"; so far: {result.outcome_summary}"
-        return [make_empty_claim(reason)]
+        return [make_empty_claim(_explain_unfinished(result))]
     # the function of the command's experiment that makes claims of a result
     make_claims = workbench.get_experiment(result.command).claims
     if not make_claims:
@@ -626,6 +692,15 @@ def collect_claims(result: results.Result) -> list[views.Claim]:
     ]
 
 
+def _explain_unfinished(result: results.Result) -> str:
+    """Return why an unfinished run has no claims, with its outcome so far."""
+    is_running = getattr(result, "ending", "") == results.RUNNING
+    reason = "the run is running" if is_running else "the run is not finished"
+    if result.outcome_summary:
+        reason += f"; so far: {result.outcome_summary}"
+    return reason
+
+
 def list_photograph_claims(photos: Any) -> list[views.Claim]:
     """Return the claim about photographs; empty if there are none.
 
@@ -638,17 +713,12 @@ def list_photograph_claims(photos: Any) -> list[views.Claim]:
     extent = results.Extent.from_count(
         "photographs that agree", agreeing, photos.photos, photos.interval
     )
-    text = (
+    statement = (
         "Photographs and renderings agree (both right, or both wrong) in "
-        f"{wording.format_extent(extent)}."
+        f"{wording.format_extent(extent)}. "
+        "The interval takes photographs as independent."
     )
-    return [
-        views.Claim(
-            kind="measured",
-            statement=f"{text} The interval takes photographs as independent.",
-            extent=extent,
-        )
-    ]
+    return [views.Claim(kind="measured", statement=statement, extent=extent)]
 
 
 def warn_of_different_models(
@@ -668,10 +738,7 @@ def warn_of_different_models(
             f"The runs are of different models: {', '.join(names)}. "
             "A claim about one is none about another."
         )
-    digests_of_model = defaultdict[str, set[str]](set)
-    for model, digest in zip(models, digests, strict=True):
-        if digest:
-            digests_of_model[model].add(digest)
+    digests_of_model = _group_digests(models, digests)
     for name in names:
         n_versions = len(digests_of_model[name])
         if n_versions > 1:
@@ -682,12 +749,24 @@ def warn_of_different_models(
     return warnings
 
 
+def _group_digests(
+    models: Sequence[str], digests: Sequence[str]
+) -> Mapping[str, set[str]]:
+    """Return the recorded digests of each model; none for a model without any."""
+    digests_of_model = defaultdict[str, set[str]](set)
+    for model, digest in zip(models, digests, strict=True):
+        if digest:
+            digests_of_model[model].add(digest)
+    return digests_of_model
+
+
 NOT_NOTED = "not noted"
 # name of the environment of a scene with lights of its own
 NO_ENVIRONMENT_MAP = "none"
 NO_CLAIM = (
     "The run carries no claim; it is listed so that the list of runs is complete."
 )
+NO_RESULT = "the run has no result yet: it is still working, or was stopped"
 WEIGHTED = (
     "How common the conditions are is stated by the weights, for their axes only."
 )
@@ -716,10 +795,6 @@ def describe_run(
     """
     run_settings = recorded[0].values if recorded else {}
     values = _get_fields(result)
-    seconds = values.get("seconds") or {}
-    setting_texts = dict[str, str]()
-    for source_settings in recorded:
-        setting_texts |= source_settings.as_text()
     return EvidenceRun(
         run=name,
         command=result.command,
@@ -729,14 +804,32 @@ def describe_run(
         searched=describe_searched(result, run_settings),
         method=_describe_measurement(result, run_settings, recorded),
         excluded=_describe_excluded(result, claims),
-        settings=setting_texts,
-        cost={
-            "Renders": _format_renders(values.get("renders")),
-            "Time": wording.format_seconds(seconds.get("total")),
-        },
+        settings=_list_setting_texts(recorded),
+        cost=_describe_cost(values),
         made_with=dict(versions) or {"versions and files": NOT_NOTED},
         command_line=str(values.get("command_line") or ""),
     )
+
+
+def _list_setting_texts(recorded: Sequence[RecordedSettings]) -> dict[str, str]:
+    """Return all recorded settings that have an effect as text, by name."""
+    setting_texts = dict[str, str]()
+    for source_settings in recorded:
+        setting_texts |= source_settings.as_text()
+    return setting_texts
+
+
+def _describe_cost(values: Mapping[str, Any]) -> dict[str, str]:
+    """Describe how many renders a run took, and how long.
+
+    Args:
+        values: fields of its result by name.
+    """
+    seconds = values.get("seconds") or {}
+    return {
+        "Renders": _format_renders(values.get("renders")),
+        "Time": wording.format_seconds(seconds.get("total")),
+    }
 
 
 def _get_fields(result: results.Result) -> dict[str, Any]:
@@ -774,12 +867,6 @@ def _describe_subject(
     """
     values = _get_fields(result)
     objects = values.get("object") or ", ".join(values.get("objects") or ())
-    # The names that count as right: a list from the result, or a text from settings.
-    right_labels = values.get("label_set") or join_setting_values(
-        recorded, "label", otherwise="the object's own label"
-    )
-    if isinstance(right_labels, list):
-        right_labels = ", ".join(right_labels)
     subject = {
         "Object": str(objects or ""),
         "Environment": _describe_environment(result),
@@ -789,10 +876,28 @@ def _describe_subject(
         "Range of its input": join_setting_values(recorded, "value_range"),
         "Task": str(values.get("task") or ""),
         "Judged thing": join_setting_values(recorded, "judge"),
-        "Counts as right": right_labels,
+        "Counts as right": _describe_right_labels(values, recorded),
         "Sought": str(values.get("goal") or ""),
     }
     return {name: text for name, text in subject.items() if text}
+
+
+def _describe_right_labels(
+    values: Mapping[str, Any], recorded: Sequence[RecordedSettings]
+) -> Any:
+    """Return the names that count as right, as a text.
+
+    Args:
+        values: fields of the result by name.
+        recorded: settings that the run recorded.
+    """
+    # a list from the result, or a text from settings
+    right_labels = values.get("label_set") or join_setting_values(
+        recorded, "label", otherwise="the object's own label"
+    )
+    if isinstance(right_labels, list):
+        return ", ".join(right_labels)
+    return right_labels
 
 
 def _describe_environment(result: results.Result) -> str:
@@ -833,22 +938,40 @@ def describe_searched(
         lines += _describe_searched_by_attack(result)
     elif is_sweep(result):
         lines += _describe_searched_by_sweep(result)
-    ranges_of_control = run_settings.get("controls")
-    if not isinstance(ranges_of_control, Mapping):  # only names, without ranges
-        ranges_of_control = {}
-    for control in getattr(result, "controls", ()):
-        ranges = ranges_of_control.get(control)
-        # A sentence about a parameter begins with its name, as "pose.yaw".
-        is_described = any(line.startswith(control) for line in lines)
-        if ranges:
-            lines.append(f"{control}, as set: {json.dumps(ranges, ensure_ascii=False)}")
-        elif not is_described:
-            lines.append(f"{control}: everything that it searches by default")
+    lines += _describe_controls(result, run_settings, lines)
     # An attack's own sentences state its budgets.
     if not is_attack(result):
         for name in ("epsilon", "epsilons"):
             if run_settings.get(name) is not None:
                 lines.append(f"{name}: {json.dumps(run_settings[name])}")
+    return lines
+
+
+def _describe_controls(
+    result: results.Result,
+    run_settings: Mapping[str, object],
+    other_lines: Sequence[str],
+) -> list[str]:
+    """Describe the controls with the ranges that the settings state, or the default.
+
+    Args:
+        result: result of the run.
+        run_settings: settings of the run.
+        other_lines: sentences about parameters. A control that they describe, and that
+            has no stated ranges, is left out.
+    """
+    ranges_of_control = run_settings.get("controls")
+    if not isinstance(ranges_of_control, Mapping):  # only names, without ranges
+        ranges_of_control = {}
+    lines = list[str]()
+    for control in getattr(result, "controls", ()):
+        ranges = ranges_of_control.get(control)
+        # A sentence about a parameter begins with its name, as "pose.yaw".
+        is_described = any(line.startswith(control) for line in (*other_lines, *lines))
+        if ranges:
+            lines.append(f"{control}, as set: {json.dumps(ranges, ensure_ascii=False)}")
+        elif not is_described:
+            lines.append(f"{control}: everything that it searches by default")
     return lines
 
 
@@ -921,23 +1044,10 @@ def _describe_measurement(
         run_settings: settings of the run.
         recorded: all settings that the run recorded, also those of other runs.
     """
+    values = _list_measurement_values(result, run_settings)
     # Settings that only name other runs have no task.
     tasks = [other.task for other in recorded if other.is_of_scene]
-    # A sweep renders only its worst configuration again.
-    trials_heading = (
-        "Trials of the worst configuration" if is_sweep(result) else "Trials"
-    )
-    # by the heading under which a report lists them
-    values = {
-        "Policy": getattr(result, "policy", None),
-        "Objective": getattr(result, "objective", None),
-        "Sampler": getattr(result, "sampler", None),
-        "Steps": run_settings.get("steps"),
-        "Seed": getattr(result, "seed", None),
-        "Samples a pixel": getattr(result, "spp", None) or run_settings.get("spp"),
-        trials_heading: run_settings.get("trials"),
-        "Judged with": "; ".join(dict.fromkeys(tasks)),
-    }
+    values["Judged with"] = "; ".join(dict.fromkeys(tasks))
     texts = {
         name: str(value) for name, value in values.items() if value not in (None, "")
     }
@@ -948,6 +1058,28 @@ def _describe_measurement(
         gains = getattr(result, "gains", None)
         texts["Pictures"] = wording.format_formation(formation, gains)
     return texts
+
+
+def _list_measurement_values(
+    result: results.Result, run_settings: Mapping[str, object]
+) -> dict[str, object]:
+    """Return how a run measured, by the headings under which a report lists it.
+
+    A value that the run does not have is None.
+    """
+    # A sweep renders only its worst configuration again.
+    trials_heading = (
+        "Trials of the worst configuration" if is_sweep(result) else "Trials"
+    )
+    return {
+        "Policy": getattr(result, "policy", None),
+        "Objective": getattr(result, "objective", None),
+        "Sampler": getattr(result, "sampler", None),
+        "Steps": run_settings.get("steps"),
+        "Seed": getattr(result, "seed", None),
+        "Samples a pixel": getattr(result, "spp", None) or run_settings.get("spp"),
+        trials_heading: run_settings.get("trials"),
+    }
 
 
 def _describe_verification(result: workbench.AttackSummary) -> str:
@@ -977,19 +1109,27 @@ def _describe_excluded(
     ]
     if is_attack(result):
         lines += _describe_excluded_by_attack(result)
-    if is_sweep(result) and result.not_finite:
+    if is_sweep(result):
+        lines += _describe_excluded_by_sweep(result)
+    if all(claim.kind == "nothing claimed" for claim in claims):
+        lines.append(NO_CLAIM)
+    return lines + list(getattr(result, "warnings", ()))
+
+
+def _describe_excluded_by_sweep(result: workbench.SweepSummary) -> list[str]:
+    """Describe predictions of a sweep that were not finite, and what it left out."""
+    lines = []
+    if result.not_finite:
         lines.append(
             f"{result.not_finite} predictions were not numbers; they count as "
             "not right."
         )
-    if is_sweep(result) and result.looked_at < result.planned:
+    if result.looked_at < result.planned:
         lines.append(
             f"Only {result.looked_at} of {result.planned} planned "
             "configurations were looked at."
         )
-    if all(claim.kind == "nothing claimed" for claim in claims):
-        lines.append(NO_CLAIM)
-    return lines + list(getattr(result, "warnings", ()))
+    return lines
 
 
 def _describe_excluded_by_attack(result: workbench.AttackSummary) -> list[str]:
@@ -1043,17 +1183,15 @@ def collect_evidence(
     """
     evidence_runs = list[EvidenceRun]()
     pictures = dict[str, bytes]()
+    weights = exposure or {}
     for number, folder in enumerate(_list_folders(runs), 1):
         run_pictures = _read_pictures(folder, number)
         pictures |= run_pictures
-        run = _make_evidence_run(folder, criterion, exposure or {}, twins)
+        run = _make_evidence_run(folder, criterion, weights, twins)
         update = {"pictures": list(run_pictures), "started": _format_start(folder)}
         evidence_runs.append(run.model_copy(update=update))
-    # A misspelled axis would otherwise be ignored silently.
-    known_axes = {row.axis for run in evidence_runs for row in run.conditions}
     warnings = _compare_models(evidence_runs)
-    for axis in sorted(set(exposure or {}) - known_axes):
-        warnings.append(f"exposure: no run has the axis {axis}.")
+    warnings += _warn_of_unknown_axes(weights, evidence_runs)
     evidence = Evidence(
         runs=evidence_runs,
         warnings=warnings,
@@ -1064,6 +1202,18 @@ def collect_evidence(
         written=f"{datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC",
     )
     return evidence, pictures
+
+
+def _warn_of_unknown_axes(exposure: Exposure, runs: Sequence[EvidenceRun]) -> list[str]:
+    """Return a warning for each weighted axis that no run has.
+
+    A misspelled axis would otherwise be ignored silently.
+    """
+    known_axes = {row.axis for run in runs for row in run.conditions}
+    return [
+        f"exposure: no run has the axis {axis}."
+        for axis in sorted(set(exposure) - known_axes)
+    ]
 
 
 def _list_folders(runs: Sequence[str]) -> list[Path]:
@@ -1153,33 +1303,41 @@ def _make_evidence_run(
     # A result that was made from sweeps is about their domain, which is the same for
     # all of them: so the first is described.
     domain = describe_domain(
-        result=sweeps[0].result if sweeps else result,
-        recorded=recorded_settings,
-        searched=searched,
+        sweeps[0].result if sweeps else result, recorded_settings, searched
     )
     conditions = count_conditions(result)
     exposure_lines = describe_exposure(result, conditions, exposure)
-    criterion_lines = []
+    criterion_lines = list[str]()
     if criterion is not None:
-        criterion_lines = describe_criterion(
-            claims, conditions, criterion, _list_selected_axes(result, sweeps)
-        )
-    return run.model_copy(
-        update={
-            "searched": searched,
-            "excluded": [*_list_quick_remarks(folder), *run.excluded],
-            "criterion": criterion_lines,
-            "triggering": list_triggering_conditions(result),
-            "exposure": exposure_lines,
-            "conditions": conditions,
-            "photographs": count_conditions(result, photo_rows),
-            "twins": _find_twins(folder, result, twins),
-            "domain": {name: part.text for name, part in domain.items()},
-            "limitations": _describe_limits(
-                claims_of_photographs, domain, is_weighted=bool(exposure_lines)
-            ),
-        }
+        axes = _list_selected_axes(result, sweeps)
+        criterion_lines = describe_criterion(claims, conditions, criterion, axes)
+    further_values = {
+        "searched": searched,
+        "excluded": [*_list_quick_remarks(folder), *run.excluded],
+        "criterion": criterion_lines,
+        "triggering": list_triggering_conditions(result),
+        "exposure": exposure_lines,
+        "conditions": conditions,
+        "photographs": count_conditions(result, photo_rows),
+        "twins": _find_twins(folder, result, twins),
+        **_describe_bounds(claims_of_photographs, domain, exposure_lines),
+    }
+    return run.model_copy(update=further_values)
+
+
+def _describe_bounds(
+    claims_of_photographs: Sequence[views.Claim],
+    domain: Mapping[str, DomainPart],
+    exposure_lines: Sequence[str],
+) -> dict[str, object]:
+    """Return the domain of a run, and what must not be concluded from it, as fields."""
+    limitations = _describe_limits(
+        claims_of_photographs, domain, is_weighted=bool(exposure_lines)
     )
+    return {
+        "domain": {name: part.text for name, part in domain.items()},
+        "limitations": limitations,
+    }
 
 
 def _find_twins(
@@ -1196,8 +1354,6 @@ def _find_twins(
     # The evidence is about a model, and some results are about none.
     if twins is None or not hasattr(result, "model"):
         return stored
-    from advsearch.extend import workbench  # it brings torch, which takes a second
-
     return workbench.find_twin_evidence(
         twins,
         model=str(getattr(result, "model", "")),
@@ -1246,8 +1402,6 @@ def _collect_versions(
     """
     versions = collect_versions(folder, read_paths)
     if getattr(result, "environment", "") == NO_ENVIRONMENT_MAP:
-        from advsearch.extend import workbench  # it brings torch, which takes a second
-
         versions.pop(f"bundled environment {workbench.DEFAULT_ENVIRONMENT}", None)
     return versions
 
@@ -1290,14 +1444,11 @@ def _make_unfinished_run(folder: Path) -> EvidenceRun:
         "Object": str(run_settings.get("object") or ""),
         "Model": str(run_settings.get("model") or ""),
     }
-    claim = make_empty_claim(
-        "the run has no result yet: it is still working, or was stopped"
-    )
     return EvidenceRun(
         run=directory.format_run_name(folder),
         command=str(run_settings.get("command") or "unknown"),
         ending="none yet",
-        claims=[claim],
+        claims=[make_empty_claim(NO_RESULT)],
         about={name: text for name, text in subject.items() if text},
         searched=[],
         method={},
@@ -1313,8 +1464,6 @@ def _read_photographs(folder: Path) -> tuple[list[views.Claim], list[Any]]:
     """Return the claims and the rows of a run's photographs."""
     if not (folder / directory.PHOTOGRAPHS).is_dir():
         return [], []
-    from advsearch.extend import workbench  # it brings torch, which takes a second
-
     claims = list_photograph_claims(workbench.load_photographs().agreement(folder))
     with Store.open_to_read(folder) as store:
         rows = list(store.rows("photo")) if claims else []
@@ -1385,15 +1534,22 @@ def _describe_searched_by_claims(
         return ["what the claims of its suite state, which cannot be read any more"]
     names_of_line = defaultdict[str, list[str]](list)
     for name, claim_settings in claims.items():
-        controls = claim_settings.get("controls") or {}
-        if not isinstance(controls, Mapping):  # names alone, separated by commas
-            controls = dict.fromkeys(str(controls).split(","))
-        for control, ranges in controls.items():
-            text = "everything it searches by default"
-            if ranges:
-                text = json.dumps(ranges, ensure_ascii=False)
-            names_of_line[f"{control}: {text}"].append(name)
-        if claim_settings.get("environment"):
-            line = f"environment: {claim_settings['environment']}"
+        for line in _list_varied_by_claim(claim_settings):
             names_of_line[line].append(name)
     return [f"{line} ({', '.join(names)})" for line, names in names_of_line.items()]
+
+
+def _list_varied_by_claim(claim_settings: Mapping[str, Any]) -> list[str]:
+    """Describe what the settings of a claim vary: each control, and the environment."""
+    controls = claim_settings.get("controls") or {}
+    if not isinstance(controls, Mapping):  # names alone, separated by commas
+        controls = dict.fromkeys(str(controls).split(","))
+    lines = []
+    for control, ranges in controls.items():
+        text = "everything it searches by default"
+        if ranges:
+            text = json.dumps(ranges, ensure_ascii=False)
+        lines.append(f"{control}: {text}")
+    if claim_settings.get("environment"):
+        lines.append(f"environment: {claim_settings['environment']}")
+    return lines

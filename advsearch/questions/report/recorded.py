@@ -129,16 +129,26 @@ class RecordedSettings:
             if name not in NOT_SETTINGS
         }
         try:
-            # raises a SettingsError, not an error of pydantic
-            config = self._config_class(**values)
-            # Fields such as `set_` have an underscore that the setting does not have.
-            return {
-                clash.setting.rstrip("_")
-                for clash in self._config_class.clashes
-                if clash.with_others(config)
-            }
+            return _find_meaningless(self._config_class, values)
         except errors.AdvsearchError:
             return set()
+
+
+def _find_meaningless(
+    config_class: type[Config], values: Mapping[str, Any]
+) -> set[str]:
+    """Return the names of settings that have no meaning together with the others.
+
+    Raises:
+        SettingsError: the settings are not valid; it is not an error of pydantic.
+    """
+    config = config_class(**values)
+    # Fields such as `set_` have an underscore that the setting does not have.
+    return {
+        clash.setting.rstrip("_")
+        for clash in config_class.clashes
+        if clash.with_others(config)
+    }
 
 
 def describe_task(task: Any, objective: object) -> str:
@@ -181,8 +191,6 @@ def _list_task_options(recorded_task: Any, objective: object) -> dict[str, Any]:
         recorded_task: the recorded setting `task`.
         objective: the recorded setting `objective`, if it is a name.
     """
-    from advsearch.extend import workbench  # it brings torch, which takes a second
-
     options = dict[str, Any]()
     with suppress(errors.AdvsearchError):
         task = workbench.make_task(recorded_task)
@@ -192,12 +200,20 @@ def _list_task_options(recorded_task: Any, objective: object) -> dict[str, Any]:
         if isinstance(task, workbench.EnsembleTask):
             task_of_prefix = {f"{part.name}.": part for part in task.parts}
         for prefix, part in task_of_prefix.items():
-            for option in fields(part):
-                value = getattr(part, option.name)
-                is_set_by_run = option.metadata == workbench.FROM_RUN
-                is_empty = value in (None, "", (), False)
-                if not is_set_by_run and not is_empty:
-                    options[f"{prefix}{option.name}"] = value
+            for name, value in _list_single_options(part).items():
+                options[f"{prefix}{name}"] = value
+    return options
+
+
+def _list_single_options(task: Any) -> dict[str, Any]:
+    """Return the options of one task that are not empty, without those of the run."""
+    options = dict[str, Any]()
+    for option in fields(task):
+        value = getattr(task, option.name)
+        is_set_by_run = option.metadata == workbench.FROM_RUN
+        is_empty = value in (None, "", (), False)
+        if not is_set_by_run and not is_empty:
+            options[option.name] = value
     return options
 
 

@@ -116,17 +116,15 @@ def make_tables(
         ("Photographs that agree", ("photographs of", "agree"), run.photographs),
     )
     for title, first_heads, conditions in tables:
-        rows = [
-            [
-                row.condition,
-                str(row.right),
-                str(row.total),
-                wording.format_interval(row.interval),
-            ]
-            for row in conditions
-        ]
+        rows = [_make_condition_cells(row) for row in conditions]
         if rows:
             yield title, (*first_heads, "of", "95 % interval"), rows
+
+
+def _make_condition_cells(row: ConditionShare) -> list[str]:
+    """Return the cells of a condition: its name, counts and interval."""
+    interval = wording.format_interval(row.interval)
+    return [row.condition, str(row.right), str(row.total), interval]
 
 
 def format_markdown(evidence: Evidence) -> str:
@@ -146,10 +144,7 @@ def _run_markdown(run: EvidenceRun) -> list[str]:
     lines += [f"- **{claim.kind}**: {_plain(claim.statement)}" for claim in run.claims]
     lines.append("")
     for _, heads, rows in make_tables(run):
-        rule = ["---"] * len(heads)  # the line that Markdown has under heads
-        for cells in (heads, rule, *rows):
-            lines.append(f"| {' | '.join(map(_plain, cells))} |")
-        lines.append("")
+        lines += [*_table_markdown(heads, rows), ""]
     if run.pictures:
         lines += [f"![{name}]({name})" for name in run.pictures]
         lines.append("")
@@ -160,6 +155,12 @@ def _run_markdown(run: EvidenceRun) -> list[str]:
         command = run.command_line.replace("```", "` ` `")
         lines += ["To repeat it:", "", "```sh", command, "```", ""]
     return lines
+
+
+def _table_markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a table."""
+    rule = ["---"] * len(heads)  # the line that Markdown has under heads
+    return [f"| {' | '.join(map(_plain, cells))} |" for cells in (heads, rule, *rows)]
 
 
 def _describe_author(evidence: Evidence) -> str:
@@ -177,12 +178,7 @@ def make_sections(run: EvidenceRun) -> dict[str, list[str]]:
     Args:
         run: the run.
     """
-
-    def list_named(texts: Mapping[str, str]) -> list[str]:
-        """Return a line for each text, with its name before it."""
-        return [f"{name}: {text}" for name, text in texts.items()]
-
-    versions = list_named(run.made_with)
+    versions = _list_named(run.made_with)
     if run.started:
         versions.insert(0, f"begun: {run.started}")
     twins = [] if run.twins is None else [wording.format_twin_evidence(run.twins)]
@@ -191,17 +187,22 @@ def make_sections(run: EvidenceRun) -> dict[str, list[str]]:
         "Criterion": run.criterion,
         "Triggering conditions": run.triggering,
         "Exposure": run.exposure,
-        "Operational design domain": list_named(run.domain),
+        "Operational design domain": _list_named(run.domain),
         "Not shown": run.limitations,
-        "On what": list_named(run.about),
+        "On what": _list_named(run.about),
         "What varied": run.searched,
-        "Measured how": list_named({"ended as": run.ending, **run.method}),
-        "Settings": list_named(run.settings),
+        "Measured how": _list_named({"ended as": run.ending, **run.method}),
+        "Settings": _list_named(run.settings),
         "Excluded, and to be known": run.excluded,
-        "Budget": list_named(run.cost),
+        "Budget": _list_named(run.cost),
         "Made with": versions,
     }
     return {title: lines for title, lines in lines_of_title.items() if lines}
+
+
+def _list_named(texts: Mapping[str, str]) -> list[str]:
+    """Return a line for each text, with its name before it."""
+    return [f"{name}: {text}" for name, text in texts.items()]
 
 
 def _plain(text: str) -> str:
@@ -221,15 +222,6 @@ def make_evidence_page(
         evidence: the evidence.
         pictures: PNG files as bytes, by the names that the evidence has for them.
     """
-    n_runs = len(evidence.runs)
-    show = "shows" if n_runs == 1 else "show"
-    claims = [claim for run in evidence.runs for claim in run.claims]
-    n_real_claims = sum(claim.kind != "nothing claimed" for claim in claims)
-    header = markup.make_header(
-        f"evidence; {n_real_claims} of {len(claims)} statements carry a claim",
-        f"What {wording.format_count(n_runs, 'run')} {show}, and no more than that.",
-        evidence.warnings,
-    )
     rules = [
         # Backquotes are Markdown's.
         markup.make_element("li", text.replace("`", ""))
@@ -243,7 +235,23 @@ def make_evidence_page(
         markup.make_element("p", _describe_author(evidence), class_="soft"),
     )
     return markup.make_document(
-        "evidence", header, main, footer="evidence. This page needs no other file."
+        "evidence",
+        _make_page_header(evidence),
+        main,
+        footer="evidence. This page needs no other file.",
+    )
+
+
+def _make_page_header(evidence: Evidence) -> markup.Html:
+    """Return the head of the page: how many claims it has, of how many runs."""
+    n_runs = len(evidence.runs)
+    show = "shows" if n_runs == 1 else "show"
+    claims = [claim for run in evidence.runs for claim in run.claims]
+    n_real_claims = sum(claim.kind != "nothing claimed" for claim in claims)
+    return markup.make_header(
+        f"evidence; {n_real_claims} of {len(claims)} statements carry a claim",
+        f"What {wording.format_count(n_runs, 'run')} {show}, and no more than that.",
+        evidence.warnings,
     )
 
 
@@ -279,14 +287,7 @@ def _list_condition_tables(run: EvidenceRun) -> list[markup.Html]:
 def _make_section_table(run: EvidenceRun) -> markup.Html:
     """Return the sections of a run as a table that can be folded, a row for each."""
     rows = [
-        markup.make_element(
-            "tr",
-            markup.make_element("th", title, scope="row"),
-            markup.make_element(
-                "td", *(markup.make_element("div", line) for line in lines)
-            ),
-        )
-        for title, lines in make_sections(run).items()
+        _make_section_row(title, lines) for title, lines in make_sections(run).items()
     ]
     table = markup.make_element(
         "table", markup.make_element("tbody", *rows), class_="facts"
@@ -294,6 +295,16 @@ def _make_section_table(run: EvidenceRun) -> markup.Html:
     summary = markup.make_element("summary", "On what, how, and what is left out")
     # With the attribute `open` it is not folded at first.
     return markup.make_element("details", summary, table, open="")
+
+
+def _make_section_row(title: str, lines: Sequence[str]) -> markup.Html:
+    """Return the row of a section, with its title as the head."""
+    divisions = [markup.make_element("div", line) for line in lines]
+    return markup.make_element(
+        "tr",
+        markup.make_element("th", title, scope="row"),
+        markup.make_element("td", *divisions),
+    )
 
 
 def _list_claim_rows(run: EvidenceRun) -> list[list[str]]:

@@ -206,11 +206,6 @@ def make_view(result: StabilityResult) -> ShownResult:
 
     A row's `holds` states what must hold, and `decides` the check that failed.
     """
-    condition_numbers = []
-    for row in result.rows:
-        for name, value in row.measurements.items():
-            if name.startswith("condition number"):
-                condition_numbers.append([f"{row.case}: {name}", f"{value:.3g}"])
     n_rows = len(result.rows)
     seconds = math.fsum(row.seconds for row in result.rows)
     failures = [
@@ -222,11 +217,21 @@ def make_view(result: StabilityResult) -> ShownResult:
         f"{n_rows - len(failures)} of {n_rows} cases hold, in {seconds:.0f} seconds.",
         [
             ResultPart.make_table(result.rows, CASE_COLUMNS, title="Cases"),
-            ResultPart("Condition numbers", rows=condition_numbers),
+            ResultPart("Condition numbers", rows=_list_condition_numbers(result.rows)),
             ResultPart("Short", failures),  # cases that "fell short"
             ResultPart("Not run", [", ".join(result.not_run)]),
         ],
     )
+
+
+def _list_condition_numbers(rows: Sequence[CaseRow]) -> list[list[str]]:
+    """Return the condition numbers that cases measured, each with a name."""
+    condition_numbers = []
+    for row in rows:
+        for name, value in row.measurements.items():
+            if name.startswith("condition number"):
+                condition_numbers.append([f"{row.case}: {name}", f"{value:.3g}"])
+    return condition_numbers
 
 
 @dataclass(frozen=True)
@@ -293,14 +298,7 @@ class Case:
         rejection of its input, any other exception as values that are not finite.
         """
         start = time.perf_counter()
-        try:
-            outcome = self.measure()
-        except InputError as error:
-            failure = make_failure(f"refused: {error}")
-            outcome = CaseOutcome([failure], ending="refused")
-        except Exception as error:
-            failure = make_failure(f"raised {type(error).__name__}: {error}")
-            outcome = CaseOutcome([failure], finite=False, ending="raised")
+        outcome = self._measure_safely()
         status, decisive_check = outcome.evaluate()
         row_fields = {
             "case": self.name,
@@ -310,6 +308,17 @@ class Case:
         }
         # `CaseRow` takes its fields from these, and ignores others, such as `measure`.
         return CaseRow.from_values({**vars(self), **vars(outcome), **row_fields})
+
+    def _measure_safely(self) -> CaseOutcome:
+        """Return the outcome of the case; that of an exception is a failure."""
+        try:
+            return self.measure()
+        except InputError as error:
+            failure = make_failure(f"refused: {error}")
+            return CaseOutcome([failure], ending="refused")
+        except Exception as error:
+            failure = make_failure(f"raised {type(error).__name__}: {error}")
+            return CaseOutcome([failure], finite=False, ending="raised")
 
 
 # every case, in the order in which they run

@@ -220,12 +220,12 @@ def check_scene(
     loss = gradients.make_smooth_loss(renderer.formation.resolution)
     image = render_image(renderer, start, seed=0, spp=spp)
     _, loss_gradient = renderer.gradient(loss, start, 0, spp)  # 0 is the seed
-    relative_error = None
-    gradient_checks: list[Check] = []
+    compared = list[results.Measured]()
     if compare:
-        gradient_checks, relative_error = _check_gradient(
-            compare_gradient(renderer, start, spp=spp, seeds=seeds, repeats=repeats)
+        compared = compare_gradient(
+            renderer, start, spp=spp, seeds=seeds, repeats=repeats
         )
+    gradient_checks, relative_error = _check_gradient(compared)
     result = search_scene(renderer, loss, start, spp, evaluations)
     measured = {
         "mean": float(image.mean()),
@@ -235,26 +235,40 @@ def check_scene(
         *_check_finite(renderer, image, result),
         *gradient_checks,
         *_check_bounds(measured, mean, gradient),
+        *_check_ending(result, ending),
     ]
-    if ending:
-        checks.append(
-            check_condition(f"the ending is {ending!r}", result.ending.value == ending)
-        )
     if other_scene is not None:
-        other_arguments: dict[str, Any] = {"controls": controls, **other_scene}
-        other_renderer = make_renderer(**other_arguments)
+        other_renderer = _make_other_renderer(controls, other_scene)
         checks.append(_compare_images(renderer, start, other_renderer, difference))
-    is_finite = bool(
-        torch.isfinite(image).all() and torch.isfinite(loss_gradient).all()
-    )
     return CaseOutcome(
         checks,
         # The renderer replaces and counts values of images that are not finite.
-        finite=is_finite and renderer.n_non_finite == 0,
+        finite=_are_finite(image, loss_gradient) and renderer.n_non_finite == 0,
         relative_error=relative_error,
         ending=result.ending.value,
         measurements=measured,
     )
+
+
+def _make_other_renderer(
+    controls: ControlSettings, other_scene: Mapping[str, object]
+) -> gradients.Renderer:
+    """Make the renderer of a second scene, which has the same controls by default."""
+    arguments: dict[str, Any] = {"controls": controls, **other_scene}
+    return make_renderer(**arguments)
+
+
+def _are_finite(image: Tensor, gradient: Tensor) -> bool:
+    """Return whether no number of an image and of a gradient is NaN or infinite."""
+    return bool(torch.isfinite(image).all() and torch.isfinite(gradient).all())
+
+
+def _check_ending(search: workbench.SearchResult, expected: str) -> list[Check]:
+    """Check the status of a search; no check if none is expected."""
+    if not expected:
+        return []
+    is_expected = search.ending.value == expected
+    return [check_condition(f"the ending is {expected!r}", is_expected)]
 
 
 def _check_finite(
@@ -477,22 +491,37 @@ def measure_inward_slope(
     """
     linear = renderer.copy_with(transfer="linear")
     u = renderer.start
-    step = 0.04  # in units of the range, small but above the noise
-    loss = gradients.make_smooth_loss(linear.formation.resolution)
     inwards = torch.where(u > 0.5, -1.0, 1.0)  # down from 1, up from 0
     increases_loss = gradient * (0.5 - u) > 0.0  # 0.5 - u points inwards, too
     direction = inwards * increases_loss * factor
-    slopes = []
-    for seed in range(seeds):
-        # losses at the bound, and one and two steps from it
-        at_0, at_1, at_2 = (
-            float(loss(render_image(linear, u + count * step * direction, seed, spp)))
-            for count in range(3)
-        )
-        # f'(0) = (4 f(h) - 3 f(0) - f(2h)) / (2h) + O(h^2), the forward difference of
-        # second order
-        slopes.append((4.0 * at_1 - 3.0 * at_0 - at_2) / (2.0 * step))
+    loss = gradients.make_smooth_loss(linear.formation.resolution)
+
+    def compute_loss(seed: int, configuration: Tensor) -> float:
+        """Return the loss at a configuration (d,), with the noise of a seed."""
+        return float(loss(render_image(linear, configuration, seed, spp)))
+
+    slopes = [
+        _compute_forward_slope(partial(compute_loss, seed), u, direction)
+        for seed in range(seeds)
+    ]
     return float(gradient @ direction), math.fsum(slopes) / seeds
+
+
+def _compute_forward_slope(
+    value: Callable[[Tensor], float], u: Tensor, direction: Tensor
+) -> float:
+    """Compute the derivative of a value by a forward difference of second order.
+
+    Args:
+        value: function of the configuration.
+        u: (d,) the configuration.
+        direction: (d,) direction of the derivative.
+    """
+    step = 0.04  # in units of the range, small but above the noise
+    # values at the bound, and one and two steps from it
+    at_0, at_1, at_2 = (value(u + count * step * direction) for count in range(3))
+    # f'(0) = (4 f(h) - 3 f(0) - f(2h)) / (2h) + O(h^2)
+    return (4.0 * at_1 - 3.0 * at_0 - at_2) / (2.0 * step)
 
 
 def evaluate(

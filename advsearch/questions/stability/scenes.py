@@ -28,6 +28,7 @@ from advsearch.questions.stability.result import (
     Case,
     CaseOutcome,
     CaseRow,
+    Check,
     StabilityConfig,
     StabilityResult,
     check_condition,
@@ -220,7 +221,6 @@ def leave_plateau(low: float, high: float) -> CaseOutcome:
     renderer = make_renderer({"camera": {"exposure": [low, high]}})
     # the highest exposure, as 1 is the upper bound of each range
     start = torch.ones_like(renderer.start)
-    start_query = workbench.Query(start, 0, gradient=True)
     checks = []
     endings = []
     n_flat = 0
@@ -231,25 +231,23 @@ def leave_plateau(low: float, high: float) -> CaseOutcome:
         n_flat += sum(record.gradient_norm == 0.0 for record in result.history)
         # `_darkness` is above 0 if the image is not white.
         is_darker = result.best_objective > 0.0
-        checks.append(
-            check_condition(
-                f"{policy.name} finds a picture that is not white", is_darker
-            )
-        )
+        description = f"{policy.name} finds a picture that is not white"
+        checks.append(check_condition(description, is_darker))
         endings.append(f"{policy.name}: {result.ending.value}")
-    start_gradient = evaluate(renderer, _darkness, 2, start_query).gradient
-    assert start_gradient is not None
-    start_check = check_range(
-        "gradient at the start",
-        float(start_gradient.abs().max()),
-        min_value=0.0,
-        max_value=0.0,
-    )
     return CaseOutcome(
-        [start_check, *checks],
+        [_check_flat_start(renderer, start), *checks],
         ending=", ".join(endings),
         measurements={"evaluations without a gradient": float(n_flat)},
     )
+
+
+def _check_flat_start(renderer: gradients.Renderer, start: Tensor) -> Check:
+    """Check that the gradient of the darkness is zero at a start (d,)."""
+    query = workbench.Query(start, 0, gradient=True)
+    gradient = evaluate(renderer, _darkness, 2, query).gradient
+    assert gradient is not None
+    largest = float(gradient.abs().max())
+    return check_range("gradient at the start", largest, min_value=0.0, max_value=0.0)
 
 
 def _darkness(image: Tensor) -> Tensor:
@@ -362,7 +360,24 @@ def texels_at_the_ends() -> CaseOutcome:
     """
     controls = {"texture": {"resolution": 8, "epsilon": 0.2}}
     renderer = make_renderer(controls, make_checkered_mug)
-    # the derivatives from the gradient and from finite differences
+    error = _measure_inward_error(renderer)
+    error_check = check_range(
+        "gradient error along a direction that points inwards",
+        error,
+        max_value=MAX_GRADIENT_ERROR,
+    )
+    loss = gradients.make_smooth_loss(renderer.formation.resolution)
+    best = run_search(renderer, loss, steps=3).best_u
+    checks = [error_check, *_check_texels(renderer.start, best)]
+    scene = check_scene(controls, make_checkered_mug, compare=False)
+    return scene.with_checks(*checks, relative_error=error)
+
+
+def _measure_inward_error(renderer: gradients.Renderer) -> float:
+    """Return the relative error of the gradient along a direction that points inwards.
+
+    The reference is the derivative by finite differences.
+    """
     slope, expected_slope = measure_inward_slope(
         renderer,
         _compute_mean_gradient(renderer),
@@ -370,16 +385,19 @@ def texels_at_the_ends() -> CaseOutcome:
         seeds=8,
         spp=REFERENCE_SPP,
     )
-    error = abs(slope / expected_slope - 1.0)
-    start = renderer.start
-    loss = gradients.make_smooth_loss(renderer.formation.resolution)
-    best = run_search(renderer, loss, steps=3).best_u
-    checks = [
-        check_range(
-            "gradient error along a direction that points inwards",
-            error,
-            max_value=MAX_GRADIENT_ERROR,
-        ),
+    return abs(slope / expected_slope - 1.0)
+
+
+def _check_texels(start: Tensor, best: Tensor) -> list[Check]:
+    """Check that a search moved texels (d,), and only inwards from 0 and 1.
+
+    Args:
+        start: the texels at the start.
+        best: those of the adversarial configuration.
+    """
+    n_moved = float((best != start).sum())
+    has_both_bounds = set(start.tolist()) == {0.0, 1.0}
+    return [
         check_range(
             "smallest texel of the adversarial configuration",
             float(best.min()),
@@ -390,15 +408,9 @@ def texels_at_the_ends() -> CaseOutcome:
             float(best.max()),
             max_value=1.0,
         ),
-        check_range(
-            "texels that the search moved", float((best != start).sum()), min_value=1.0
-        ),
-        check_condition(
-            "the start has both 0 and 1", set(start.tolist()) == {0.0, 1.0}
-        ),
+        check_range("texels that the search moved", n_moved, min_value=1.0),
+        check_condition("the start has both 0 and 1", has_both_bounds),
     ]
-    scene = check_scene(controls, make_checkered_mug, compare=False)
-    return scene.with_checks(*checks, relative_error=error)
 
 
 def _compute_mean_gradient(renderer: gradients.Renderer) -> Tensor:
@@ -747,6 +759,7 @@ def million() -> CaseOutcome:
     fine = make_renderer(SHIFT, make_checkered_object(fine_mesh))
     loss = gradients.make_smooth_loss(fine.formation.resolution)
     _, slope = fine.gradient(loss, fine.start, 0, SPP)
+    is_finite = bool(torch.isfinite(slope).all())
     difference = compute_mean_difference(
         render_image(fine, fine.start, seed=0, spp=REFERENCE_SPP),
         render_image(coarse, coarse.start, seed=0, spp=REFERENCE_SPP),
@@ -754,9 +767,7 @@ def million() -> CaseOutcome:
     scene = check_scene(TEXTURE, make_checkered_object(fine_mesh), evaluations=2)
     return scene.with_checks(
         check_range("triangles", float(len(fine_mesh.faces)), min_value=1e6),
-        check_condition(
-            "the gradient by a shift is finite", bool(torch.isfinite(slope).all())
-        ),
+        check_condition("the gradient by a shift is finite", is_finite),
         check_range(
             "mean difference from a sphere of 16,000",
             difference,
@@ -787,26 +798,29 @@ def gimbal() -> CaseOutcome:
     by_angles = make_renderer(angles, make_dark_mug, settings=NO_GROUND)
     yawed = render_image(by_angles, torch.tensor(yawed_u))
     rolled = render_image(by_angles, torch.tensor(rolled_u))
+    vector_check = _check_rotation_vector()
+    scene = check_scene(
+        angles, make_dark_mug, settings=NO_GROUND, u=yawed_u, spp=2 * SPP
+    )
+    pose_check = check_range(
+        "mean difference of yaw 36 and roll -36",
+        compute_mean_difference(yawed, rolled),
+        max_value=MAX_PICTURE_DIFFERENCE,
+    )
+    return scene.with_checks(pose_check, vector_check)
 
+
+def _check_rotation_vector() -> Check:
+    """Check the gradient by the rotation vector near a pitch of 90 degrees."""
     # The rotation vector is searched around the pitch of 90 degrees; the comparison is
     # a little off the start.
     vector = {"pose": {"rotation": [-90.0, 90.0], "pitch": 90.0, "on_ground": "no"}}
     by_vector = make_renderer(vector, make_dark_mug, settings=NO_GROUND)
     rows = compare_gradient(by_vector, by_vector.start + 0.1, seeds=(3, 5))
-    scene = check_scene(
-        angles, make_dark_mug, settings=NO_GROUND, u=yawed_u, spp=2 * SPP
-    )
-    return scene.with_checks(
-        check_range(
-            "mean difference of yaw 36 and roll -36",
-            compute_mean_difference(yawed, rolled),
-            max_value=MAX_PICTURE_DIFFERENCE,
-        ),
-        check_range(
-            "gradient error of the rotation vector",
-            max(row.excess for row in rows),  # the error that noise does not explain
-            max_value=MAX_GRADIENT_ERROR,
-        ),
+    return check_range(
+        "gradient error of the rotation vector",
+        max(row.excess for row in rows),  # the error that noise does not explain
+        max_value=MAX_GRADIENT_ERROR,
     )
 
 
@@ -822,10 +836,7 @@ def full_turn(controls: ControlSettings) -> CaseOutcome:
     renderer = make_renderer(controls)
     zero = torch.zeros_like(renderer.start)
     full = torch.ones_like(renderer.start)
-    loss = gradients.make_smooth_loss(renderer.formation.resolution)
-    _, zero_slope = renderer.gradient(loss, zero, 0, SPP)
-    _, full_slope = renderer.gradient(loss, full, 0, SPP)
-    slope_difference = float((zero_slope - full_slope).abs().max())
+    gradient_check = _compare_turn_gradients(renderer, zero, full)
     difference = compute_mean_difference(
         render_image(renderer, zero), render_image(renderer, full)
     )
@@ -838,11 +849,7 @@ def full_turn(controls: ControlSettings) -> CaseOutcome:
             difference,
             max_value=MAX_PICTURE_DIFFERENCE,
         ),
-        check_range(
-            "difference of the gradients",
-            slope_difference / float(zero_slope.abs().max()),
-            max_value=0.05,
-        ),
+        gradient_check,
         # The configuration is one angle.
         check_range(
             "where a step of 0.01 past the end goes",
@@ -850,6 +857,21 @@ def full_turn(controls: ControlSettings) -> CaseOutcome:
             min_value=0.0099,
             max_value=0.0101,
         ),
+    )
+
+
+def _compare_turn_gradients(
+    renderer: gradients.Renderer, zero: Tensor, full: Tensor
+) -> Check:
+    """Check that the gradients at 0 and at 360 degrees, two configurations, are equal."""
+    loss = gradients.make_smooth_loss(renderer.formation.resolution)
+    _, zero_slope = renderer.gradient(loss, zero, 0, SPP)
+    _, full_slope = renderer.gradient(loss, full, 0, SPP)
+    slope_difference = float((zero_slope - full_slope).abs().max())
+    return check_range(
+        "difference of the gradients",
+        slope_difference / float(zero_slope.abs().max()),
+        max_value=0.05,
     )
 
 
@@ -899,11 +921,8 @@ def run_cases(context: RunContext[StabilityConfig]) -> StabilityResult:
 
     def make_result(rows: list[CaseRow]) -> StabilityResult:
         """Return the result with the rows so far."""
-        return context.result(
-            StabilityResult,
-            rows=rows,
-            not_run=[case.name for case in cases[len(rows) :]],
-        )
+        not_run = [case.name for case in cases[len(rows) :]]
+        return context.result(StabilityResult, rows=rows, not_run=not_run)
 
     return measurements.make_result_of_rows(measure_rows(), make_result)
 
@@ -1035,34 +1054,44 @@ def light_rotation_texel() -> CaseOutcome:
     u = renderer.start.clone()
     u[:2] = torch.tensor([0.5, 0.1])  # power and rotation; texels follow
     hessian = _estimate_three_curvatures(renderer, u)
-    # One watt is 1/12 in u, as the range of the power is 12 W; one degree is 1/360; and
-    # sRGB values of texels are those in u.
-    unit_in_u = torch.tensor([1.0 / 12.0, 1.0 / 360.0, 1.0]).double()
-    hessian_in_units = torch.diag(unit_in_u) @ hessian @ torch.diag(unit_in_u)
     path, _ = _record_path(renderer, u, scale=1.0)
     scaled_path, ending = _record_path(renderer, u, scale=RATIO)
-    distances = (path - path[0]).abs().amax(dim=0)
     path_difference = float((path - scaled_path).abs().max())
     scene = check_scene(controls, u={0: 0.5, 1: 0.1}, compare=False)
     return scene.with_checks(
-        check_range("how far the power moved", float(distances[0]), min_value=0.05),
-        check_range("how far the rotation moved", float(distances[1]), min_value=0.05),
-        check_range(
-            "how far the texels moved", float(distances[2:].max()), min_value=0.05
-        ),
+        *_check_movement(path),
         check_range(
             "distance from the path of the objective x 1e6",
             path_difference,
             max_value=1e-3,
         ),
         ending=ending,
-        measurements={
-            "condition number in u": condition_number(hessian),
-            "condition number in watts, degrees and sRGB": condition_number(
-                hessian_in_units
-            ),
-        },
+        measurements=_compute_condition_numbers(hessian),
     )
+
+
+def _check_movement(path: Tensor) -> list[Check]:
+    """Check that power, rotation and texels moved along a path (steps, d)."""
+    distances = (path - path[0]).abs().amax(dim=0)
+    texel_distance = float(distances[2:].max())
+    return [
+        check_range("how far the power moved", float(distances[0]), min_value=0.05),
+        check_range("how far the rotation moved", float(distances[1]), min_value=0.05),
+        check_range("how far the texels moved", texel_distance, min_value=0.05),
+    ]
+
+
+def _compute_condition_numbers(hessian: Tensor) -> dict[str, float]:
+    """Compute condition numbers of a Hessian (3, 3) in u, and in other units."""
+    # One watt is 1/12 in u, as the range of the power is 12 W; one degree is 1/360; and
+    # sRGB values of texels are those in u.
+    unit_in_u = torch.tensor([1.0 / 12.0, 1.0 / 360.0, 1.0]).double()
+    hessian_in_units = torch.diag(unit_in_u) @ hessian @ torch.diag(unit_in_u)
+    in_units = condition_number(hessian_in_units)
+    return {
+        "condition number in u": condition_number(hessian),
+        "condition number in watts, degrees and sRGB": in_units,
+    }
 
 
 def _estimate_three_curvatures(renderer: gradients.Renderer, u: Tensor) -> Tensor:
@@ -1151,21 +1180,28 @@ def heavy_render(count: int = 24) -> CaseOutcome:
     controls = {"pose": {"x": [-0.3, 0.3]}}
     renderer = make_renderer(controls).copy_with(transfer="linear")
     renderer.plan = renderer.plan.with_pixel_steps()
-    loss = gradients.make_smooth_loss(renderer.formation.resolution)
-    gradient_samples = []
-    for seed in range(count):
-        _, gradient = renderer.gradient(loss, renderer.start, seed, 4)
-        gradient_samples.append(gradient)
-    slopes = torch.stack(gradient_samples).double()
+    slopes = _sample_slopes(renderer, count)
     # There is one entry, the derivative by the shift.
     distance = (slopes - slopes.median()).abs()
+    takes_secant = renderer.plan.groups[0].estimator == "secant"
     return check_scene(controls, compare=False, spp=4).with_checks(
         check_range(
             "farthest over the median distance",
             float(distance.max() / distance.median()),
             max_value=12.0,
         ),
-        check_condition(
-            "the plan takes secant", renderer.plan.groups[0].estimator == "secant"
-        ),
+        check_condition("the plan takes secant", takes_secant),
     )
+
+
+def _sample_slopes(renderer: gradients.Renderer, count: int) -> Tensor:
+    """Return gradients (count, d) of a smooth loss at the start, float64.
+
+    Each has 4 samples per pixel and its own seed.
+    """
+    loss = gradients.make_smooth_loss(renderer.formation.resolution)
+    gradient_samples = []
+    for seed in range(count):
+        _, gradient = renderer.gradient(loss, renderer.start, seed, 4)
+        gradient_samples.append(gradient)
+    return torch.stack(gradient_samples).double()

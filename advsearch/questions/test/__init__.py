@@ -55,6 +55,20 @@ def test(
 
     config = context.config
     # Files are checked before the test, which may take hours.
+    files = _find_report_files(config)
+    parsed_suite = None if suite is None else parse_suite(suite, config.suite)
+    result = try_suite(context, parsed_suite)
+    for name, path in files.items():
+        writing.write_text(path, FILE_FORMATS[name](result), durable=False)
+    return result
+
+
+def _find_report_files(config: SuiteConfig) -> dict[str, Path]:
+    """Return the files for other programs, by the settings that name them.
+
+    Raises:
+        InputError: the folder of a file does not exist.
+    """
     files: dict[str, Path] = {}
     for name in FILE_FORMATS:
         file = getattr(config, name)
@@ -66,8 +80,4 @@ def test(
                 f"{name}: expected a file in a folder that exists, got "
                 f"{path}; make the folder first"
             )
-    parsed_suite = None if suite is None else parse_suite(suite, config.suite)
-    result = try_suite(context, parsed_suite)
-    for name, path in files.items():
-        writing.write_text(path, FILE_FORMATS[name](result), durable=False)
-    return result
+    return files

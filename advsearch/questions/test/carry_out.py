@@ -89,45 +89,88 @@ def try_suite(
     start = time.perf_counter()
     config = context.config
     context.progress.stage("reading the suite")
-    # A run of `twins` compares renders with photographs. If it cannot be read, the
-    # error is raised before the work begins.
-    if config.twins is not None:
-        workbench.read_twins(config.twins)
+    _check_twins(config)
     # A resumed run has stored the suite with which it has started, and tests that, even
     # if the file has changed since.
     noted_suite = _read_noted_suite(context.resumed_directory)
     loaded_suite = noted_suite or suite or _read_suite(config)
-    added = None
-    if config.add is not None:
-        added = counterexamples.add_counterexample(config.suite, config.add)
-    try:
-        planned = _plan_claims(loaded_suite, config, added)
-        is_from_caller = loaded_suite is suite
-        if not is_from_caller:
-            # A file, or a stored run, may come from others. Without permission of the
-            # user, its settings must not run code or have other effects outside of the
-            # run.
-            for claim in planned:
-                claim.config.check_no_effects(f"claims.{claim.name}.settings")
-        remarks = _check_claims(planned, loaded_suite)
-    except InputError as error:
-        if added is not None:
-            counterexamples.delete_counterexample(added)
-        raise InputError(f"{config.suite}: {error}") from None
+    added = _add_counterexample(config)
+    planned, remarks = _plan_checked_claims(
+        loaded_suite, config, added, is_from_caller=loaded_suite is suite
+    )
     _note_settings(context, loaded_suite, planned)
     for remark in remarks:
         context.progress.message(remark)
     tester = ClaimTester(context, loaded_suite, start_time=start, warnings=remarks)
     suite_run = _SuiteRun(tester, planned, counterexamples.read_expected(config.suite))
     context.ending = suite_run.run_claims()
-    # With `add`, the only result is that of the new counterexample.
-    if added is not None and suite_run.results[0].verdict != FAILED:
+    if added is not None:
+        # With `add`, the only result is that of the new counterexample.
+        _check_added(added, suite_run.results[0], config)
+    return suite_run.make_result(context.ending, added)
+
+
+def _check_twins(config: SuiteConfig) -> None:
+    """Raise an error if the run of `twins` that the settings name cannot be read.
+
+    Such a run compares renders with photographs. The error comes before the work begins.
+    """
+    if config.twins is not None:
+        workbench.read_twins(config.twins)
+
+
+def _check_added(
+    added: Counterexample, result: ClaimResult, config: SuiteConfig
+) -> None:
+    """Delete a new counterexample, and raise an error, unless the model fails on it."""
+    if result.verdict != FAILED:
         counterexamples.delete_counterexample(added)
         raise InputError(
-            f"add: the adversarial scene of {config.add} is not stored: "
-            f"{suite_run.results[0].reason}"
+            f"add: the adversarial scene of {config.add} is not stored: {result.reason}"
         )
-    return suite_run.make_result(context.ending, added)
+
+
+def _add_counterexample(config: SuiteConfig) -> Counterexample | None:
+    """Store the counterexample that the setting `add` names; None without it."""
+    if config.add is None:
+        return None
+    return counterexamples.add_counterexample(config.suite, config.add)
+
+
+def _plan_checked_claims(
+    suite: Suite,
+    config: SuiteConfig,
+    added: Counterexample | None,
+    *,
+    is_from_caller: bool,
+) -> tuple[list[PlannedClaim], list[str]]:
+    """Plan what is tested, and check it; after an error `added` is deleted.
+
+    Args:
+        suite: the suite.
+        config: settings of the command.
+        added: the new counterexample; None if there is none.
+        is_from_caller: whether the caller has passed the suite.
+
+    Returns:
+        What is tested, and remarks about it.
+
+    Raises:
+        InputError: something cannot be tested, or needs a permission.
+    """
+    try:
+        planned = _plan_claims(suite, config, added)
+        if not is_from_caller:
+            # A file, or a stored run, may come from others. Without permission of the
+            # user, its settings must not run code or have other effects outside of the
+            # run.
+            for claim in planned:
+                claim.config.check_no_effects(f"claims.{claim.name}.settings")
+        return planned, _check_claims(planned, suite)
+    except InputError as error:
+        if added is not None:
+            counterexamples.delete_counterexample(added)
+        raise InputError(f"{config.suite}: {error}") from None
 
 
 def _read_noted_suite(resumed: Path | None) -> Suite | None:
@@ -175,7 +218,15 @@ def _note_settings(
         if claim.counterexample is not None
     }
     run.store.write_note(SETTINGS_NOTE, json.dumps(settings_of_examples))
-    # The files in these settings must not change before the run is resumed.
+    # A new run stores the digests of the files in these settings, and a resumed run
+    # compares them: they must not change before the run is resumed.
+    run.check_files_unchanged(_list_used_settings(suite, planned))
+
+
+def _list_used_settings(
+    suite: Suite, planned: Sequence[PlannedClaim]
+) -> list[dict[str, Any]]:
+    """Return all settings that name files: those of what is tested, and other models."""
     used_settings = list[dict[str, Any]]()
     for planned_claim in planned:
         used_settings.append(planned_claim.config.to_json())
@@ -184,8 +235,7 @@ def _note_settings(
         claim = suite.claims[planned_claim.name]
         if isinstance(claim, NoWorseClaim):
             used_settings.append({"model": claim.than})
-    # A new run stores the digests of these files, and a resumed run compares them.
-    run.check_files_unchanged(used_settings)
+    return used_settings
 
 
 @dataclass
@@ -213,19 +263,9 @@ class _SuiteRun:
         with tester.context.until_interrupted():
             for number, claim in enumerate(self.planned, start=1):
                 self._add_result(claim, self._test_claim(claim))
-                last = self.results[-1]
-                tester.progress.message(f"{claim.name}: {last.verdict}: {last.reason}")
-                if number < len(self.planned):
-                    # The summary is written after each claim, so that it can be read
-                    # even if the run is killed: then it states that it was interrupted.
-                    so_far = self.make_result(results.INTERRUPTED, added=None)
-                    tester.run.write_summary(so_far)
+                self._report_last(is_last=number == len(self.planned))
         if tester.context.ending == results.INTERRUPTED:
-            for claim in self.planned[len(self.results) :]:
-                untested = self._make_untested(
-                    claim, INTERRUPTED_REASON, Cause.INTERRUPTED
-                )
-                self._add_result(claim, untested)
+            self._add_interrupted()
             return results.INTERRUPTED
         causes = {result.cause for result in self.results}
         if Cause.COUNTEREXAMPLE_FAILED in causes:
@@ -234,6 +274,25 @@ class _SuiteRun:
                 "tested; with the setting `all` they are tested, too."
             )
         return results.OUT_OF_TIME if Cause.OUT_OF_TIME in causes else "done"
+
+    def _report_last(self, *, is_last: bool) -> None:
+        """Show the last result, and write a summary unless it is that of the last claim.
+
+        The summary is written after each claim, so that it can be read even if the run
+        is killed: then it states that it was interrupted.
+        """
+        result = self.results[-1]
+        message = f"{result.name}: {result.verdict}: {result.reason}"
+        self.tester.progress.message(message)
+        if not is_last:
+            so_far = self.make_result(results.INTERRUPTED, added=None)
+            self.tester.run.write_summary(so_far)
+
+    def _add_interrupted(self) -> None:
+        """Add undecided results of the claims that an interrupt left out."""
+        for claim in self.planned[len(self.results) :]:
+            untested = self._make_untested(claim, INTERRUPTED_REASON, Cause.INTERRUPTED)
+            self._add_result(claim, untested)
 
     def _test_claim(self, claim: PlannedClaim) -> ClaimResult:
         """Return the result of a claim, and test the claim if necessary.
@@ -253,21 +312,27 @@ class _SuiteRun:
             return untested
         pending = self._make_untested(claim, "")
         start = time.perf_counter()
-        if claim.counterexample is None:
-            tested = tester.test_claim(
-                pending, tester.suite.claims[claim.name], claim.config
-            )
-        else:
-            assert isinstance(claim.config, AttackConfig)
-            tested = tester.test_counterexample(
-                pending, claim.counterexample, claim.config
-            )
+        tested = self._run_test(claim, pending)
         if tested.cause is Cause.INTERRUPTED:
             raise KeyboardInterrupt  # Ctrl-C in a part of the run ends all of it
         tested = tested.model_copy(update={"seconds": time.perf_counter() - start})
         if tested.cause is not Cause.OUT_OF_TIME:
             tester.run.store.write_note(key, json.dumps(tested.to_dict()))
         return tested
+
+    def _run_test(self, claim: PlannedClaim, pending: ClaimResult) -> ClaimResult:
+        """Test a claim or a counterexample, and return its result.
+
+        Args:
+            claim: the claim or the counterexample.
+            pending: its result without a verdict.
+        """
+        tester = self.tester
+        if claim.counterexample is None:
+            suite_claim = tester.suite.claims[claim.name]
+            return tester.test_claim(pending, suite_claim, claim.config)
+        assert isinstance(claim.config, AttackConfig)
+        return tester.test_counterexample(pending, claim.counterexample, claim.config)
 
     def _refuse_claim(self, claim: PlannedClaim) -> ClaimResult | None:
         """Return the result of a claim that must not be tested, else None.
@@ -363,12 +428,7 @@ class _SuiteRun:
         config = tester.config
         configs = [claim.config for claim in self.planned]
         controls = [name for config in configs for name in config.controls]
-        # claims after the last one that has a result
-        not_reached = [
-            self._make_untested(claim, NOT_TESTED_YET, Cause.NOT_REACHED)
-            for claim in self.planned[len(self.results) :]
-        ]
-        claims = [*self.results, *not_reached]
+        claims = self._list_all_results()
         changes = list[str]()
         if config.update and ending == "done":
             claims, changes = self._update_expected(claims)
@@ -393,6 +453,14 @@ class _SuiteRun:
             python_only=config.python_only,
             twins=self._find_twin_evidence(configs),
         )
+
+    def _list_all_results(self) -> list[ClaimResult]:
+        """Return the results so far, and undecided ones of claims after the last one."""
+        not_reached = [
+            self._make_untested(claim, NOT_TESTED_YET, Cause.NOT_REACHED)
+            for claim in self.planned[len(self.results) :]
+        ]
+        return [*self.results, *not_reached]
 
     def _update_expected(
         self, claims: Sequence[ClaimResult]
@@ -465,29 +533,42 @@ def _plan_claims(
         InputError: a claim and a counterexample have the same name, or `only` selects
             nothing or has an unknown name.
     """
-    changes = {
-        "model": config.model,
-        "threads": config.threads,
-        # False is the default, which must not override the suite's setting.
-        "deterministic": config.deterministic or None,
-    }
+    changes = _list_changes(config)
     if added is None:
         examples = counterexamples.read_counterexamples(config.suite)
     else:
         examples = [added]
     planned = [_plan_example(example, suite, changes) for example in examples]
-    for claim in planned:
-        if claim.name in suite.claims:
-            raise InputError(
-                f"claims.{claim.name}: a counterexample has the same name; rename the "
-                "claim"
-            )
+    _check_example_names(planned, suite)
     if added is not None:
         return planned
     for name, suite_claim in suite.claims.items():
         claim_config = suite.make_config(name, **changes).with_python_parts_of(config)
         planned.append(PlannedClaim(name, suite_claim.claim, claim_config))
     return _select_claims(planned, config)
+
+
+def _list_changes(config: SuiteConfig) -> dict[str, Any]:
+    """Return the settings of the command that override those of a suite, by name.
+
+    None stands for a setting that is not changed.
+    """
+    return {
+        "model": config.model,
+        "threads": config.threads,
+        # False is the default, which must not override the suite's setting.
+        "deterministic": config.deterministic or None,
+    }
+
+
+def _check_example_names(planned: Sequence[PlannedClaim], suite: Suite) -> None:
+    """Raise an error if a counterexample has the name of a claim."""
+    for claim in planned:
+        if claim.name in suite.claims:
+            raise InputError(
+                f"claims.{claim.name}: a counterexample has the same name; rename the "
+                "claim"
+            )
 
 
 def _select_claims(
@@ -504,16 +585,7 @@ def _select_claims(
     for name in config.selected_claims:
         if name not in known:
             raise errors.UnknownNameError("claim in `only`", name, known)
-    if not config.selected_claims:
-        selected = list(planned)
-    else:
-        all_examples = ALL_COUNTEREXAMPLES in config.selected_claims
-        selected = [
-            claim
-            for claim in planned
-            if claim.name in config.selected_claims
-            or (all_examples and claim.counterexample is not None)
-        ]
+    selected = [claim for claim in planned if _is_selected(claim, config)]
     # Every other name selects something, and a suite has at least one claim.
     if not selected:
         raise InputError(
@@ -523,6 +595,14 @@ def _select_claims(
             "`add_counterexample`, or leave `only` out"
         )
     return selected
+
+
+def _is_selected(claim: PlannedClaim, config: SuiteConfig) -> bool:
+    """Return whether the setting `only` selects a claim; without names it does."""
+    if not config.selected_claims or claim.name in config.selected_claims:
+        return True
+    all_examples = ALL_COUNTEREXAMPLES in config.selected_claims
+    return all_examples and claim.counterexample is not None
 
 
 def _plan_example(
@@ -578,14 +658,18 @@ def _check_claims(planned: Sequence[PlannedClaim], suite: Suite) -> list[str]:
     for planned_claim, claim in claims:
         for config in _list_used_configs(planned_claim, claim):
             # Many claims share their settings, which are checked once.
-            if config in checked:
-                continue
-            try:
-                workbench.check_from_config(config)
-            except InputError as error:
-                raise InputError(f"claims.{planned_claim.name}: {error}") from None
-            checked.append(config)
+            if config not in checked:
+                _check_loading(planned_claim.name, config)
+                checked.append(config)
     return list(filter(None, remarks))
+
+
+def _check_loading(name: str, config: AttackConfig) -> None:
+    """Load everything that the settings of a claim name; an error names the claim."""
+    try:
+        workbench.check_from_config(config)
+    except InputError as error:
+        raise InputError(f"claims.{name}: {error}") from None
 
 
 def _list_used_configs(planned: PlannedClaim, claim: AnyClaim) -> list[AttackConfig]:

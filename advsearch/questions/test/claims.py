@@ -137,6 +137,19 @@ class _PictureSample:
     verdict: str = UNDECIDED
     worst: _Example | None = None
 
+    def add_score(self, score: float, judgement: tasks.Judgement) -> None:
+        """Add the score of an image that counts, and what is stored if it is wrong."""
+        self.scores.append(score)
+        if not judgement.right:
+            self.wrong_payloads.append(judgement.payload)
+
+    def add_example(
+        self, violation_score: float, query: workbench.Query, text: str
+    ) -> None:
+        """Add an example against the claim; only the worst one stays."""
+        if self.worst is None or violation_score > self.worst.violation_score:
+            self.worst = _Example(violation_score, query, text)
+
 
 @dataclass
 class _TrialSample:
@@ -154,6 +167,17 @@ class _TrialSample:
     wrong_payloads: list[Any] = field(default_factory=list)
     label: str = ""
     picture: str | None = None
+
+    def add_outcome(self, outcome: bool | None, trial: tasks.Judgement) -> bool:
+        """Add the outcome of a trial, and return whether the model is wrong in it.
+
+        The outcome is None for a trial that does not count.
+        """
+        self.outcomes.append(outcome)
+        is_wrong = outcome is False
+        if is_wrong:
+            self.wrong_payloads.append(trial.payload)
+        return is_wrong
 
     @property
     def n_right(self) -> int:
@@ -267,21 +291,15 @@ class ClaimTester:
         picture = None
         if evaluated.verdict == FAILED:
             picture = self._find_search_picture(untested_result.name, summary)
-        # "products" are images that were computed by matrices of light transport, and
-        # not rendered.
-        n_pictures = sum(
-            count for name, count in summary.renders.items() if name != "products"
-        )
-        return untested_result.model_copy(
-            update={
-                "verdict": evaluated.verdict,
-                "reason": evaluated.reason,
-                "cause": evaluated.cause,
-                "part": untested_result.name,
-                "pictures": n_pictures,
-                "picture": picture,
-            }
-        )
+        update = {
+            "verdict": evaluated.verdict,
+            "reason": evaluated.reason,
+            "cause": evaluated.cause,
+            "part": untested_result.name,
+            "pictures": _count_rendered(summary),
+            "picture": picture,
+        }
+        return untested_result.model_copy(update=update)
 
     def _find_search_picture(
         self, name: str, summary: workbench.AttackSummary
@@ -334,45 +352,48 @@ class ClaimTester:
             claim: the claim.
             config: settings of the pictures.
         """
+        name = untested_result.name
         problem = self._load_problem(config)
         # A claim is held by the lower bound of the mean score, and failed by the upper
         # bound. At most one of the two is wrong, so each may be one-sided.
         sequence = statistics.sequential.ConfidenceSequence(
             self.suite.confidence, sides=1
         )
-        with self._open_evaluations(
-            untested_result.name, claim, config, problem
-        ) as evaluated:
+        with self._open_evaluations(name, claim, config, problem) as evaluated:
             sample = self._sample_pictures(evaluated, claim, sequence)
 
-        example = ""
-        picture = None
-        if sample.worst is not None:
-            query = sample.worst.query
-            example = f"{sample.worst.text}: {self._describe(problem, query)}"
-            picture = self._save_picture(untested_result.name, problem, query)
+        example, picture = self._report_worst(name, problem, sample.worst)
         is_late = sample.verdict == UNDECIDED and self.out_of_time
-        reason = _describe_sample(
-            claim, sample, sequence.interval, example, problem.task.name
-        )
+        task = problem.task.name
+        reason = _describe_sample(claim, sample, sequence.interval, example, task)
         if is_late:
             reason += f"; {OUT_OF_TIME_REASON}"
-        rate = None
-        if sample.scores:
-            # a tuple with one converted number for each argument
-            (rate,) = _to_claim_scale(claim, sequence.mean)
-        return untested_result.model_copy(
-            update={
-                "verdict": sample.verdict,
-                "reason": reason,
-                "cause": Cause.OUT_OF_TIME if is_late else None,
-                "interval": _to_claim_scale(claim, *sequence.interval),
-                "pictures": len(sample.scores),
-                "spp": samples_per_pixel(config),
-                "rate": rate,
-                "picture": picture,
-            }
-        )
+        update = {
+            **_make_sample_fields(claim, sample, sequence),
+            "reason": reason,
+            "cause": Cause.OUT_OF_TIME if is_late else None,
+            "spp": samples_per_pixel(config),
+            "picture": picture,
+        }
+        return untested_result.model_copy(update=update)
+
+    def _report_worst(
+        self, name: str, problem: Problem, worst: _Example | None
+    ) -> tuple[str, str | None]:
+        """Describe the worst example against a claim, and save its picture.
+
+        Args:
+            name: name of the claim.
+            problem: problem of the model under test.
+            worst: the example; None if there is none.
+
+        Returns:
+            The description, and the path of the picture; "" and None without example.
+        """
+        if worst is None:
+            return "", None
+        example = f"{worst.text}: {self._describe(problem, worst.query)}"
+        return example, self._save_picture(name, problem, worst.query)
 
     @staticmethod
     def _sample_pictures(
@@ -399,17 +420,11 @@ class ClaimTester:
             if score is None:
                 sample.n_hidden += 1
                 continue
-            judgement = evaluation.required_judgement
-            if not judgement.right:
-                sample.wrong_payloads.append(judgement.payload)
             sequence.add(score)
-            sample.scores.append(score)
-            is_worst = (
-                sample.worst is None or violation_score > sample.worst.violation_score
-            )
+            sample.add_score(score, evaluation.required_judgement)
             is_against_claim = score == 0.0
-            if is_against_claim and is_worst:
-                sample.worst = _Example(violation_score, query, text)
+            if is_against_claim:
+                sample.add_example(violation_score, query, text)
             sample.verdict = _decide(sequence, compute_score_threshold(claim))
             if sample.verdict != UNDECIDED:
                 break
@@ -439,33 +454,20 @@ class ClaimTester:
         """
         worker_call, worker_config = self._choose_worker(claim, config)
         other_problem, change = self._load_other_side(claim, config, problem)
-        self.progress.stage(
-            name,
-            claim.pictures,
-            hint="fewer pictures in the suite shorten it",
-            at_most=True,
-        )
+        hint = "fewer pictures in the suite shorten it"
+        self.progress.stage(name, claim.pictures, hint=hint, at_most=True)
         queries = sample_queries(
             problem, f"claim {name}", claim.pictures, samples_per_pixel(config)
         )
         with workbench.open_executor(
             worker_config, worker_call, self.progress
         ) as executor:
-            if isinstance(claim, NoWorseClaim):
-                # Workers (`claim_worker`) load both models. A request names the model
-                # by its index: "0" is the one under test, "1" the other one.
-                evaluator = workbench.ParallelEvaluator(problem, executor, "0")
-                other_evaluator = workbench.ParallelEvaluator(
-                    other_problem, executor, "1"
-                )
-            else:
-                evaluator = workbench.ParallelEvaluator(problem, executor)
-                # Changed images are predicted in this process, without workers. (A
-                # `RightClaim` has no other side, so that this is not used.)
-                other_evaluator = workbench.ParallelEvaluator(other_problem)
+            evaluator, other_evaluator = _make_evaluators(
+                claim, problem, other_problem, executor
+            )
             journal = workbench.Journal(self.run, evaluator)
             other = None
-            if not isinstance(claim, RightClaim):
+            if other_evaluator is not None:
                 other_journal = workbench.Journal(self.run, other_evaluator)
                 other = _OtherSide(other_journal, change)
             yield self._evaluate_queries(journal, queries, other)
@@ -549,22 +551,9 @@ class ClaimTester:
             other_side: what the model is compared with, such as another model; None if
                 there is no other side.
         """
-        # Without workers a batch has one query, so that nothing more is rendered once
-        # the claim is decided.
-        batch_size = 1
-        if journal.evaluator.workers is not None:
-            # The number of workers of a cluster is not known.
-            n_workers = self.config.workers or CLUSTER_WORKERS
-            batch_size = BATCHES_AHEAD * n_workers
+        batch_size = self._choose_batch_size(journal)
         while batch := list(islice(queries, batch_size)):
-            evaluations: Iterable[policies.Evaluation]
-            others: Iterable[policies.Evaluation | None] = repeat(None)
-            if other_side is None:
-                # No images are needed for another side.
-                evaluate = partial(_evaluate_with_pictures, journal, None)
-                evaluations = journal.evaluate_all(batch, evaluate)
-            else:
-                evaluations, others = _evaluate_batch(journal, other_side, batch)
+            evaluations, others = _evaluate_sides(journal, other_side, batch)
             for query, evaluation, other in zip(
                 batch, evaluations, others, strict=False
             ):
@@ -572,6 +561,18 @@ class ClaimTester:
                 yield query, evaluation, other
             if self.out_of_time:
                 return
+
+    def _choose_batch_size(self, journal: workbench.Journal) -> int:
+        """Return how many queries are evaluated at once.
+
+        Without workers a batch has one query, so that nothing more is rendered once the
+        claim is decided.
+        """
+        if journal.evaluator.workers is None:
+            return 1
+        # The number of workers of a cluster is not known.
+        n_workers = self.config.workers or CLUSTER_WORKERS
+        return BATCHES_AHEAD * n_workers
 
     def test_counterexample(
         self,
@@ -589,10 +590,7 @@ class ClaimTester:
             example: the counterexample.
             config: settings with which it is tested.
         """
-        statement = (
-            f"{config.model} is right on a scene that was predicted as "
-            f"{example.wrong_label}"
-        )
+        statement = _state_counterexample(config.model, example)
         untested_result = untested_result.model_copy(update={"statement": statement})
         try:
             parts = workbench.load_parts(config)
@@ -601,18 +599,8 @@ class ClaimTester:
         except InputError as error:
             reason = words.describe_unsuitable(str(error))
             return untested_result.model_copy(update={"reason": reason})
-        changed_file = example.find_changed_file(config)
-        if changed_file:
-            reason = (
-                f"the file {changed_file} has changed; restore it, or remove the "
-                "counterexample"
-            )
-            return untested_result.model_copy(update={"reason": reason})
-        if compute_scene_digest(parts.scene.description) != example.scene_digest:
-            reason = (
-                "its scene has changed; remove it, or add the adversarial scene of a "
-                "new run"
-            )
+        reason = _explain_change(example, config, parts)
+        if reason:
             return untested_result.model_copy(update={"reason": reason})
         return self._test_by_trials(
             untested_result, example, problem, has_conditions=varies_conditions(config)
@@ -645,14 +633,9 @@ class ClaimTester:
             has_conditions=has_conditions
         )
         if is_late:
-            reasons = [OUT_OF_TIME_REASON]
-            if sample.outcomes:  # the reason states what these trials were
-                reasons = [update["reason"], OUT_OF_TIME_REASON]
-            update |= {
-                "verdict": UNDECIDED,
-                "reason": "; ".join(reasons),
-                "cause": Cause.OUT_OF_TIME,
-            }
+            # The reason states what the trials were, if there were any.
+            reasons = [update["reason"]] if sample.outcomes else []
+            update |= _make_late_fields(reasons)
         update |= {"picture": sample.picture, "spp": example.spp}
         return untested_result.model_copy(update=update)
 
@@ -676,24 +659,16 @@ class ClaimTester:
         prefix = "added " if self.config.add is not None else ""
         kind = f"{prefix}counterexample {example.name}"
         journal = workbench.Journal(self.run, workbench.ParallelEvaluator(problem))
-        max_renders = count_trials(has_conditions=has_conditions)
-        if has_conditions:
-            # Twice as many trials as needed may be made, since some may not count. Each
-            # has two renders, one of them of the clean scene.
-            max_renders *= 2 * 2
+        max_renders = _count_trial_renders(has_conditions=has_conditions)
         self.progress.stage(example.name, max_renders, at_most=True)
         sample = _TrialSample()
         for query, trial, clean in self._run_trials(
             journal, kind, u, example.spp, has_conditions=has_conditions
         ):
-            outcome = is_right_in_trial(trial, clean)
-            sample.outcomes.append(outcome)
-            # `outcome` is None for a trial that does not count.
-            if outcome is False:
-                sample.wrong_payloads.append(trial.payload)
-                if not sample.label:
-                    sample.label = trial.prediction.label
-                    sample.picture = self._save_picture(example.name, problem, query)
+            is_wrong = sample.add_outcome(is_right_in_trial(trial, clean), trial)
+            if is_wrong and not sample.label:
+                sample.label = trial.prediction.label
+                sample.picture = self._save_picture(example.name, problem, query)
             if sample.is_enough(has_conditions=has_conditions):
                 break
         return sample
@@ -724,14 +699,9 @@ class ClaimTester:
             Query and judgement of the configuration, and the judgement of the clean
             scene. The latter is None without varying conditions.
         """
-        clean_u = journal.problem.domain.start
-        queries = list[workbench.Query]()
-        for index in range(2 * count_trials(has_conditions=has_conditions)):
-            seed = seeds.derive_seed(self.suite.seed, kind, index)
-            query = workbench.Query(u, seed, kind, index, spp=spp)
-            queries.append(query)
-            if has_conditions:
-                queries.append(replace(query, u=clean_u, kind=f"{kind}, clean"))
+        queries = self._list_trial_queries(
+            journal.problem, kind, u, spp, has_conditions=has_conditions
+        )
         evaluated = self._evaluate_queries(journal, iter(queries))
         for query, trial, _ in evaluated:
             if not has_conditions:
@@ -744,6 +714,28 @@ class ClaimTester:
                 return
             _, clean, _ = clean_result  # query, evaluation, no other side
             yield query, trial.required_judgement, clean.required_judgement
+
+    def _list_trial_queries(
+        self, problem: Problem, kind: str, u: Tensor, spp: int, *, has_conditions: bool
+    ) -> list[workbench.Query]:
+        """Return the queries of trials, each followed by that of the clean scene, if any.
+
+        Args:
+            problem: problem of the model under test.
+            kind: kind of their seeds and stored rows.
+            u: (d,) the configuration.
+            spp: samples per pixel.
+            has_conditions: whether conditions vary, so that the clean scene is evaluated.
+        """
+        clean_u = problem.domain.start
+        queries = list[workbench.Query]()
+        for index in range(2 * count_trials(has_conditions=has_conditions)):
+            seed = seeds.derive_seed(self.suite.seed, kind, index)
+            query = workbench.Query(u, seed, kind, index, spp=spp)
+            queries.append(query)
+            if has_conditions:
+                queries.append(replace(query, u=clean_u, kind=f"{kind}, clean"))
+        return queries
 
     def _load_problem(self, config: SceneConfig) -> Problem:
         """Load scene, model and task, and add remarks on them to the warnings."""
@@ -774,6 +766,136 @@ class ClaimTester:
         if len(values) > MAX_DESCRIBED_VALUES:
             texts.append("...")
         return ", ".join(texts)
+
+
+def _count_rendered(summary: workbench.AttackSummary) -> int:
+    """Return the number of images that an attack has rendered."""
+    # "products" are images that were computed by matrices of light transport, and
+    # not rendered.
+    return sum(count for name, count in summary.renders.items() if name != "products")
+
+
+def _make_sample_fields(
+    claim: ShareClaim | NoWorseClaim,
+    sample: _PictureSample,
+    sequence: statistics.sequential.ConfidenceSequence,
+) -> dict[str, object]:
+    """Return the numbers of a `ClaimResult` that follow from sampled images.
+
+    Args:
+        claim: what is claimed.
+        sample: the images.
+        sequence: confidence sequence of the mean score.
+    """
+    rate = None
+    if sample.scores:
+        # a tuple with one converted number for each argument
+        (rate,) = _to_claim_scale(claim, sequence.mean)
+    return {
+        "verdict": sample.verdict,
+        "interval": _to_claim_scale(claim, *sequence.interval),
+        "pictures": len(sample.scores),
+        "rate": rate,
+    }
+
+
+def _make_evaluators(
+    claim: ShareClaim | NoWorseClaim,
+    problem: Problem,
+    other_problem: Problem,
+    executor: Any,
+) -> tuple[workbench.ParallelEvaluator, workbench.ParallelEvaluator | None]:
+    """Make the evaluators of the model under test, and of the other side, if any.
+
+    Args:
+        claim: the claim.
+        problem: problem of the model under test.
+        other_problem: problem of the other side.
+        executor: the workers.
+    """
+    if isinstance(claim, NoWorseClaim):
+        # Workers (`claim_worker`) load both models. A request names the model
+        # by its index: "0" is the one under test, "1" the other one.
+        return (
+            workbench.ParallelEvaluator(problem, executor, "0"),
+            workbench.ParallelEvaluator(other_problem, executor, "1"),
+        )
+    evaluator = workbench.ParallelEvaluator(problem, executor)
+    if isinstance(claim, RightClaim):
+        return evaluator, None
+    # Changed images are predicted in this process, without workers.
+    return evaluator, workbench.ParallelEvaluator(other_problem)
+
+
+def _state_counterexample(model: str, example: Counterexample) -> str:
+    """State what is claimed about a model by a counterexample."""
+    return f"{model} is right on a scene that was predicted as {example.wrong_label}"
+
+
+def _explain_change(
+    example: Counterexample, config: AttackConfig, parts: workbench.AttackParts
+) -> str:
+    """Return why a counterexample is not tested, if it has changed; else "".
+
+    Args:
+        example: the counterexample.
+        config: settings with which it is tested.
+        parts: loaded parts of its attack.
+    """
+    changed_file = example.find_changed_file(config)
+    if changed_file:
+        return (
+            f"the file {changed_file} has changed; restore it, or remove the "
+            "counterexample"
+        )
+    if compute_scene_digest(parts.scene.description) != example.scene_digest:
+        return (
+            "its scene has changed; remove it, or add the adversarial scene of a "
+            "new run"
+        )
+    return ""
+
+
+def _make_late_fields(reasons: Sequence[str]) -> dict[str, Any]:
+    """Return the fields of a result whose test ended since the time was over.
+
+    Args:
+        reasons: what is known about it.
+    """
+    return {
+        "verdict": UNDECIDED,
+        "reason": "; ".join([*reasons, OUT_OF_TIME_REASON]),
+        "cause": Cause.OUT_OF_TIME,
+    }
+
+
+def _count_trial_renders(*, has_conditions: bool) -> int:
+    """Return the maximum number of renders of the trials of a counterexample."""
+    max_renders = count_trials(has_conditions=has_conditions)
+    if has_conditions:
+        # Twice as many trials as needed may be made, since some may not count. Each
+        # has two renders, one of them of the clean scene.
+        max_renders *= 2 * 2
+    return max_renders
+
+
+def _evaluate_sides(
+    journal: workbench.Journal,
+    other_side: _OtherSide | None,
+    batch: Sequence[workbench.Query],
+) -> tuple[Iterable[policies.Evaluation], Iterable[policies.Evaluation | None]]:
+    """Return the evaluations of a batch of queries by the model and by the other side.
+
+    Args:
+        journal: evaluates the model under test, and stores the rows.
+        other_side: what the model is compared with; None if there is no other side.
+        batch: the queries.
+    """
+    if other_side is None:
+        # No images are needed for another side.
+        evaluate = partial(_evaluate_with_pictures, journal, None)
+        return journal.evaluate_all(batch, evaluate), repeat(None)
+    return _evaluate_batch(journal, other_side, batch)
 
 
 def _evaluate_with_pictures(
@@ -950,15 +1072,34 @@ def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
     n_to_fail = count_needed(1.0 - threshold)
     needed = max(n_to_hold, n_to_fail)
     if claim.pictures < needed:
-        raise InputError(
-            f"claims.{name}.pictures: expected at least {needed}, since with fewer one "
-            "of the verdicts held and failed is impossible at a confidence of "
-            f"{wording.format_number(confidence)}, got {claim.pictures}"
-        )
+        raise _make_too_few_pictures_error(name, claim.pictures, needed, confidence)
     if not isinstance(claim, NoWorseClaim):
         return ""
     # Models that predict alike have a score of 1/2 on each picture.
-    needed_if_equal = count_needed(threshold, value=0.5)
+    return _remark_on_equal_models(name, claim, count_needed(threshold, value=0.5))
+
+
+def _make_too_few_pictures_error(
+    name: str, n_pictures: int, needed: int, confidence: float
+) -> InputError:
+    """Make the error that a claim has fewer pictures than are needed for a verdict."""
+    return InputError(
+        f"claims.{name}.pictures: expected at least {needed}, since with fewer one "
+        "of the verdicts held and failed is impossible at a confidence of "
+        f"{wording.format_number(confidence)}, got {n_pictures}"
+    )
+
+
+def _remark_on_equal_models(
+    name: str, claim: NoWorseClaim, needed_if_equal: int
+) -> str:
+    """Return a remark if a claim has too few images for two equal models, else "".
+
+    Args:
+        name: name of the claim.
+        claim: the claim.
+        needed_if_equal: number of images with which it can be held for them.
+    """
     if claim.pictures >= needed_if_equal:
         return ""
     return (
@@ -990,26 +1131,37 @@ def score_picture(
     if prediction.is_out_of_view:
         return _PictureScore(None)
     if other is None:
-        # The larger the score of a judgement, the more wrong is the model. The image
-        # with the largest score is reported, but not one with an infinite score or NaN.
-        violation_score = -math.inf
-        if math.isfinite(judgement.score):
-            violation_score = judgement.score
-        text = f"most wrong where it says {prediction.label}"
-        score = float(judgement.right)
-        return _PictureScore(score, violation_score, text)
+        return _score_alone(judgement)
     other_judgement = other.required_judgement
     other_prediction = other_judgement.prediction
     if isinstance(claim, ChangeClaim):
-        # No image violates such a claim more than another: the first one is reported.
-        text = f"{prediction.label} before and {other_prediction.label} after"
-        is_as_claimed = workbench.meets_claim(claim.claim, prediction, other_prediction)
-        return _PictureScore(float(is_as_claimed), text=text)
+        return _score_change(claim, prediction, other_prediction)
     # Images of different sizes may differ in whether the object is visible.
     if other_prediction.is_out_of_view:
         return _PictureScore(None)
     difference = int(judgement.right) - int(other_judgement.right)  # -1, 0 or 1
     return _PictureScore((difference + 1) / 2)
+
+
+def _score_change(
+    claim: ChangeClaim, before: tasks.Prediction, after: tasks.Prediction
+) -> _PictureScore:
+    """Score an image by the predictions before and after a change."""
+    # No image violates such a claim more than another: the first one is reported.
+    text = f"{before.label} before and {after.label} after"
+    is_as_claimed = workbench.meets_claim(claim.claim, before, after)
+    return _PictureScore(float(is_as_claimed), text=text)
+
+
+def _score_alone(judgement: tasks.Judgement) -> _PictureScore:
+    """Score an image by the judgement of the model under test alone."""
+    # The larger the score of a judgement, the more wrong is the model. The image
+    # with the largest score is reported, but not one with an infinite score or NaN.
+    violation_score = -math.inf
+    if math.isfinite(judgement.score):
+        violation_score = judgement.score
+    text = f"most wrong where it says {judgement.prediction.label}"
+    return _PictureScore(float(judgement.right), violation_score, text)
 
 
 def _decide(
@@ -1048,38 +1200,55 @@ def _describe_sample(
             It is not used for a `NoWorseClaim`.
         task: name of the task.
     """
-    n_for = sample.scores.count(1.0)  # images for the claim
     if isinstance(claim, NoWorseClaim):
-        lower, upper = _to_claim_scale(claim, *interval)
-        reason = words.describe_difference(
-            sample.verdict,
-            n_pictures=len(sample.scores),
-            n_only_this=n_for,
-            n_only_other=sample.scores.count(0.0),
-            interval=(lower, upper),
-            other_model=claim.than,
-        )
+        reason = _describe_compared_sample(claim, sample, interval)
     else:
-        is_right_claim = isinstance(claim, RightClaim)
-        outcomes = ""
-        if is_right_claim:
-            outcome_counts = workbench.count_outcomes(sample.wrong_payloads)
-            outcomes = wording.format_outcomes(outcome_counts, task)
-        reason = words.describe_fraction(
-            "right" if is_right_claim else "as claimed",
-            sample.verdict,
-            n_for,
-            len(sample.scores),
-            interval,
-            example,
-            outcomes,
-        )
+        reason = _describe_share_sample(claim, sample, interval, example, task)
     if sample.n_hidden:
         reason += (
             f"; the object is not to be seen in {sample.n_hidden} more, "
             "which are not counted"
         )
     return reason
+
+
+def _describe_compared_sample(
+    claim: NoWorseClaim, sample: _PictureSample, interval: tuple[float, float]
+) -> str:
+    """Describe how often each of two models alone is right; see `_describe_sample`."""
+    lower, upper = _to_claim_scale(claim, *interval)
+    return words.describe_difference(
+        sample.verdict,
+        n_pictures=len(sample.scores),
+        n_only_this=sample.scores.count(1.0),
+        n_only_other=sample.scores.count(0.0),
+        interval=(lower, upper),
+        other_model=claim.than,
+    )
+
+
+def _describe_share_sample(
+    claim: ShareClaim,
+    sample: _PictureSample,
+    interval: tuple[float, float],
+    example: str,
+    task: str,
+) -> str:
+    """Describe in how many images the claim is met; see `_describe_sample`."""
+    is_right_claim = isinstance(claim, RightClaim)
+    outcomes = ""
+    if is_right_claim:
+        outcome_counts = workbench.count_outcomes(sample.wrong_payloads)
+        outcomes = wording.format_outcomes(outcome_counts, task)
+    return words.describe_fraction(
+        "right" if is_right_claim else "as claimed",
+        sample.verdict,
+        sample.scores.count(1.0),  # images for the claim
+        len(sample.scores),
+        interval,
+        example,
+        outcomes,
+    )
 
 
 def _trials_result(
@@ -1092,17 +1261,42 @@ def _trials_result(
         task: name of the task.
         has_conditions: whether conditions vary.
     """
-    total = sample.n_right + sample.n_wrong
-    verdict = decide_trials(
-        sample.n_right, sample.n_wrong, has_conditions=has_conditions
-    )
+    n_right = sample.n_right
+    total = n_right + sample.n_wrong
+    verdict = decide_trials(n_right, sample.n_wrong, has_conditions=has_conditions)
     interval = None
-    rate = None
     if total:
-        interval = statistics.intervals.clopper_pearson(sample.n_right, total)
-        rate = sample.n_right / total
+        interval = statistics.intervals.clopper_pearson(n_right, total)
+    return {
+        "verdict": verdict,
+        "reason": _explain_trials(
+            sample, verdict, interval, task, has_conditions=has_conditions
+        ),
+        "pictures": len(sample.outcomes),
+        "rate": n_right / total if total else None,
+        "interval": interval,
+    }
+
+
+def _explain_trials(
+    sample: _TrialSample,
+    verdict: str,
+    interval: tuple[float, float] | None,
+    task: str,
+    *,
+    has_conditions: bool,
+) -> str:
+    """Describe why trials of a counterexample have a verdict.
+
+    Args:
+        sample: the trials.
+        verdict: HELD, FAILED or UNDECIDED.
+        interval: interval of the fraction of right trials; None if no trial counts.
+        task: name of the task.
+        has_conditions: whether conditions vary.
+    """
     outcome_counts = workbench.count_outcomes(sample.wrong_payloads)
-    reason = words.describe_trials(
+    return words.describe_trials(
         verdict,
         n_right=sample.n_right,
         n_wrong=sample.n_wrong,
@@ -1112,13 +1306,6 @@ def _trials_result(
         has_conditions=has_conditions,
         outcomes=wording.format_outcomes(outcome_counts, task),
     )
-    return {
-        "verdict": verdict,
-        "reason": reason,
-        "pictures": len(sample.outcomes),
-        "rate": rate,
-        "interval": interval,
-    }
 
 
 def _same_picture(_query: workbench.Query, picture: Tensor) -> Tensor:

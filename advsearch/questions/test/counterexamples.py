@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isqrt
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeGuard
 
 import numpy as np
 import torch
@@ -165,19 +165,11 @@ class _Block(BaseModel):
         """
         is_small = len(values) <= MAX_FINE_VALUES
         stores_signs = signs and not is_small
-        step = COARSE_STEP
-        if is_small:
-            step = FINE_STEP
-        elif stores_signs:
-            # With the largest offset as the step, rounding leaves only -1, 0 and 1. If
-            # all offsets are 0, the step may be any positive number.
-            step = float(np.abs(values).max()) or 1.0
-        # A texture has side * side texels of 3 values.
-        side = isqrt(len(values) // 3)
-        is_texture = not is_small and 3 * side * side == len(values)
-        if not is_texture or side % square != 0:
-            square = 1
+        step = _choose_quantum(values, is_small=is_small, stores_signs=stores_signs)
         square_values = values
+        side = isqrt(len(values) // 3)  # if it is a texture
+        if is_small or not _has_squares(len(values), square):
+            square = 1
         if square > 1:
             square_values = _average_squares(values, side, square)
         # little-endian 16-bit integers, the same on all machines
@@ -233,6 +225,30 @@ class _Block(BaseModel):
         if self.signs:
             return _unpack_signs(data, n_steps)
         return np.frombuffer(data, "<i2")
+
+
+def _choose_quantum(values: Floats, *, is_small: bool, stores_signs: bool) -> float:
+    """Return the step of which the offsets of a block are stored as multiples.
+
+    Args:
+        values: the offsets (n,).
+        is_small: whether the block has few values.
+        stores_signs: whether only signs are stored.
+    """
+    if is_small:
+        return FINE_STEP
+    if stores_signs:
+        # With the largest offset as the step, rounding leaves only -1, 0 and 1. If
+        # all offsets are 0, the step may be any positive number.
+        return float(np.abs(values).max()) or 1.0
+    return COARSE_STEP
+
+
+def _has_squares(n_values: int, square: int) -> bool:
+    """Return whether values are a texture (side, side, 3) that squares of texels tile."""
+    # A texture has side * side texels of 3 values.
+    side = isqrt(n_values // 3)
+    return 3 * side * side == n_values and side % square == 0
 
 
 def _average_squares(values: Floats, side: int, square: int) -> Floats:
@@ -336,19 +352,11 @@ class Counterexample:
             InputError: its settings do not suit that network.
         """
         changed = {name: value for name, value in changes.items() if value is not None}
-        network_settings = {
-            name: value
-            for name, value in {**suite.settings, **changed}.items()
-            if name in MODEL_SETTINGS
-        }
-        replaces_network = "model" in network_settings
+        network_settings = _select_network_settings({**suite.settings, **changed})
         # settings that are reset to their defaults
         reset_names = {*SUITE_SETTINGS}
-        if replaces_network:
+        if network_settings:
             reset_names |= {*MODEL_SETTINGS}
-        else:
-            # Settings of one network do not suit another: none of them is used.
-            network_settings = {}
         defaults = {
             setting.name: setting.default
             for setting in settings.settings(AttackConfig)
@@ -379,6 +387,16 @@ class Counterexample:
                 "add the adversarial scene of a new run"
             )
         return (start + torch.from_numpy(self.clean_offsets)).clamp(0.0, 1.0)
+
+
+def _select_network_settings(values: Mapping[str, object]) -> dict[str, object]:
+    """Return the settings of the network under test, if they name a model; else none.
+
+    Settings of one network do not suit another.
+    """
+    if "model" not in values:
+        return {}
+    return {name: value for name, value in values.items() if name in MODEL_SETTINGS}
 
 
 def counterexample_directory(suite: str) -> Path:
@@ -497,14 +515,7 @@ def _fails_on_example(
     configurations = [u, start] if has_conditions else [u]
     outcomes = list[bool | None]()
     for index in range(trials):
-        # a stream of seeds that only these trials use
-        seed = seeds.derive_seed(problem.seed, "kept", index)
-        judgements = []
-        for configuration in configurations:
-            picture = problem.picture(configuration, seed, example.spp)
-            full_configuration = problem.make_full_configuration(configuration, seed)
-            judgements.append(problem.judge(picture, full_configuration))
-        is_right = is_right_in_trial(*judgements)
+        is_right = _try_configurations(problem, configurations, index, example.spp)
         outcomes.append(is_right)
         # After one right trial, the verdict of a single scene cannot be FAILED.
         if is_right and not has_conditions:
@@ -512,6 +523,35 @@ def _fails_on_example(
     n_right = outcomes.count(True)
     n_wrong = outcomes.count(False)
     return decide_trials(n_right, n_wrong, has_conditions=has_conditions) == FAILED
+
+
+def _try_configurations(
+    problem: Problem, configurations: Sequence[Tensor], index: int, spp: int
+) -> bool | None:
+    """Return whether the model is right in a trial; None if the trial does not count.
+
+    Args:
+        problem: problem of the run.
+        configurations: (d,) the counterexample; and the clean scene if conditions vary.
+        index: index of the trial.
+        spp: samples per pixel.
+    """
+    # a stream of seeds that only these trials use
+    seed = seeds.derive_seed(problem.seed, "kept", index)
+    judgements = [
+        _judge_render(problem, configuration, seed, spp)
+        for configuration in configurations
+    ]
+    return is_right_in_trial(*judgements)
+
+
+def _judge_render(
+    problem: Problem, configuration: Tensor, seed: int, spp: int
+) -> tasks.Judgement:
+    """Render a configuration (d,), and judge the prediction about it."""
+    picture = problem.picture(configuration, seed, spp)
+    full_configuration = problem.make_full_configuration(configuration, seed)
+    return problem.judge(picture, full_configuration)
 
 
 def add_counterexample(suite: str, run: str) -> Counterexample:
@@ -530,16 +570,7 @@ def add_counterexample(suite: str, run: str) -> Counterexample:
     """
     path = directory.find_run(run)
     summary = workbench.load_attack_summary(path)
-    if summary.ending != "found" or summary.verified is None:
-        raise InputError(
-            f"add: expected a run that ended as 'found', got {path}, "
-            f"which ended with {summary.ending!r}"
-        )
-    if summary.minimises:  # the objective: the search made the object easier
-        raise InputError(
-            f"add: expected a run that makes the model wrong, got {path}, "
-            "which makes the object easier"
-        )
+    _check_addable(path, summary)
     parts = workbench.load_parts_of_run(path)
     problem, _warnings = workbench.make_problem_with_warnings(parts)
     configuration = workbench.read_stored_configuration(path, problem)
@@ -553,6 +584,20 @@ def add_counterexample(suite: str, run: str) -> Counterexample:
     return _write_smallest(
         base, values, offsets, problem, has_conditions=varies_conditions(config)
     )
+
+
+def _check_addable(path: Path, summary: workbench.AttackSummary) -> None:
+    """Raise an error unless an attack has found a scene that the model gets wrong."""
+    if summary.ending != "found" or summary.verified is None:
+        raise InputError(
+            f"add: expected a run that ended as 'found', got {path}, "
+            f"which ended with {summary.ending!r}"
+        )
+    if summary.minimises:  # the objective: the search made the object easier
+        raise InputError(
+            f"add: expected a run that makes the model wrong, got {path}, "
+            "which makes the object easier"
+        )
 
 
 def _make_values(
@@ -571,11 +616,6 @@ def _make_values(
     """
     verified = summary.verified
     assert verified is not None
-    stored_settings = {
-        name: value
-        for name, value in config.to_json().items()
-        if name not in NOT_DECIDING
-    }
     # Settings whose files must not change. Those of the network are not among them,
     # since the suite may replace the network.
     settings_with_files = make_paths_relative(select_deciding_settings(config))
@@ -584,10 +624,19 @@ def _make_values(
         "run": path.name,
         # the most frequent wrong prediction
         "said": next(iter(verified.labels), ""),
-        "settings": make_paths_relative(stored_settings),
+        "settings": make_paths_relative(_select_stored_settings(config)),
         "files": directory.summary.compute_file_digests(settings_with_files),
         "scene": compute_scene_digest(parts.scene.description),
         "spp": verified.spp,
+    }
+
+
+def _select_stored_settings(config: AttackConfig) -> dict[str, Any]:
+    """Return the settings that a counterexample stores, by name."""
+    return {
+        name: value
+        for name, value in config.to_json().items()
+        if name not in NOT_DECIDING
     }
 
 
@@ -614,16 +663,8 @@ def _write_smallest(
     """
     block_sizes = [block.size for block in problem.domain.blocks]
     blocks = np.split(offsets, np.cumsum(block_sizes)[:-1])
-    *coarse_forms, finest_form = FORMS
-    # All forms store a block of up to `MAX_FINE_VALUES` in the same way.
-    has_large_block = max(block_sizes) > MAX_FINE_VALUES
-    if not has_large_block:
-        coarse_forms = []
-    trials = count_trials(has_conditions=has_conditions)
-    if not has_conditions:
-        # The model has to be wrong in all trials. Twice as many trials as the suite
-        # makes, so that the model will most likely fail there, too.
-        trials *= 2
+    trials = _count_confirming_trials(has_conditions=has_conditions)
+    *coarse_forms, finest_form = _list_forms(max(block_sizes))
     for stores_signs, square in coarse_forms:
         # This replaces the file of the form before.
         example = _write_form(base, values, blocks, stores_signs, square)
@@ -631,6 +672,25 @@ def _write_smallest(
             return example
     stores_signs, square = finest_form
     return _write_form(base, values, blocks, stores_signs, square)
+
+
+def _list_forms(max_block_size: int) -> Sequence[tuple[bool, int]]:
+    """Return the forms of a counterexample that differ, from the coarsest to the finest.
+
+    A form is whether only signs are stored, and the side of the squares of texels that
+    share a value.
+    """
+    # All forms store a block of up to `MAX_FINE_VALUES` in the same way.
+    has_large_block = max_block_size > MAX_FINE_VALUES
+    return FORMS if has_large_block else FORMS[-1:]
+
+
+def _count_confirming_trials(*, has_conditions: bool) -> int:
+    """Return the number of trials by the run's own model before an example is stored."""
+    trials = count_trials(has_conditions=has_conditions)
+    # If conditions do not vary, the model has to be wrong in all trials. Twice as many
+    # trials as the suite makes, so that the model will most likely fail there, too.
+    return trials if has_conditions else 2 * trials
 
 
 def _write_form(
@@ -779,24 +839,35 @@ def read_expected(suite: str) -> dict[str, str]:
     path = counterexample_directory(suite) / EXPECTED_FILE
     if not path.is_file():
         return {}
-    try:
-        text = stored_files.read_text(path, "what is expected of a suite", MAX_SIZE)
-        values = stored_files.parse_json(text)
-    except (OSError, ValueError) as error:
-        raise errors.FileFormatError(
-            f"{path}: expected verdicts by claim, got {str(error)[:80]}; remove it"
-        ) from None
-    verdicts: Any = None
-    if isinstance(values, dict):
-        verdicts = values.get("expected")
-    has_verdicts = isinstance(verdicts, dict) and all(
-        str(verdict) in VERDICTS for verdict in verdicts.values()
-    )
-    if not has_verdicts:
+    values = _read_expected_json(path)
+    verdicts = values.get("expected") if isinstance(values, dict) else None
+    if not _are_verdicts(verdicts):
         raise errors.FileFormatError(
             f"{path}: expected verdicts by claim, got something else; remove it"
         )
     return {str(name): str(verdict) for name, verdict in verdicts.items()}
+
+
+def _read_expected_json(path: Path) -> Any:
+    """Read the content of the file with expected verdicts, unchecked.
+
+    Raises:
+        FileFormatError: the file is no JSON.
+    """
+    try:
+        text = stored_files.read_text(path, "what is expected of a suite", MAX_SIZE)
+        return stored_files.parse_json(text)
+    except (OSError, ValueError) as error:
+        raise errors.FileFormatError(
+            f"{path}: expected verdicts by claim, got {str(error)[:80]}; remove it"
+        ) from None
+
+
+def _are_verdicts(values: Any) -> TypeGuard[dict[Any, Any]]:
+    """Return whether a value that was read from a file has verdicts by claim."""
+    return isinstance(values, dict) and all(
+        str(verdict) in VERDICTS for verdict in values.values()
+    )
 
 
 def write_expected(suite: str, verdicts: Mapping[str, str]) -> list[str]:

@@ -31,12 +31,7 @@ def read_noted_settings(
     with Store.open_to_read(run) as store:
         suite = store.read_json_note(SUITE_NOTE)
         settings_of_examples = store.read_json_note(SETTINGS_NOTE)
-    # other claims have one of these two causes
-    tested = {
-        claim.name
-        for claim in result.claims
-        if claim.cause not in (Cause.COUNTEREXAMPLE_FAILED, Cause.NOT_REACHED)
-    }
+    tested = _list_tested(result)
     settings: dict[str, dict[str, Mapping[str, Any]]] = {}
     # A stored suite that is corrupt causes one of these errors.
     with suppress(KeyError, AttributeError, TypeError, ValueError):
@@ -52,6 +47,16 @@ def read_noted_settings(
             if name in tested and isinstance(values, Mapping)
         }
     return settings
+
+
+def _list_tested(result: SuiteResult) -> set[str]:
+    """Return the names of the claims and counterexamples that were tested."""
+    # all others have one of these two causes
+    return {
+        claim.name
+        for claim in result.claims
+        if claim.cause not in (Cause.COUNTEREXAMPLE_FAILED, Cause.NOT_REACHED)
+    }
 
 
 def _settings_of_claims(suite: Any) -> dict[str, Mapping[str, Any]]:

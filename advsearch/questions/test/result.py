@@ -175,30 +175,37 @@ def make_view(result: SuiteResult) -> ShownResult:
     First comes a table of all claims, then a section for each claim that is not held,
     with its picture and the command that repeats it.
     """
-    sections = [
-        ResultPart(
-            "The claims",
-            column_heads=TABLE_HEADS,
-            rows=make_table_rows(result),
-            note=READING_NOTE,
-            parts=[claim.part for claim in result.claims],
-        )
-    ]
+    sections = [_make_claims_part(result)]
     for claim in result.claims:
         # There is no section for a claim that is held, nor for one that was not tested.
         was_not_tested = claim.cause is Cause.COUNTEREXAMPLE_FAILED
-        if claim.verdict == HELD or was_not_tested:
-            continue
-        pictures = []
-        if claim.picture:
-            caption = f"{claim.statement}: {claim.verdict}. {claim.reason}."
-            pictures.append([views.Picture(claim.picture, caption)])
-        rows = [["repeat", claim.repeat]]
-        sections.append(ResultPart(claim.name, rows=rows, pictures=pictures))
+        if claim.verdict != HELD and not was_not_tested:
+            sections.append(_make_claim_section(claim))
     sections.append(ResultPart("Expected from now on", result.changes))
     subject = [Path(result.suite).name, result.object, result.model]
     summary = f"{result.title}. {describe_suite(result)}"
     return ShownResult(summary, sections, list_facts(result), subject)
+
+
+def _make_claims_part(result: SuiteResult) -> ResultPart:
+    """Make the table of all claims."""
+    return ResultPart(
+        "The claims",
+        column_heads=TABLE_HEADS,
+        rows=make_table_rows(result),
+        note=READING_NOTE,
+        parts=[claim.part for claim in result.claims],
+    )
+
+
+def _make_claim_section(claim: ClaimResult) -> ResultPart:
+    """Make the section of a claim: its picture, and the command that repeats it."""
+    pictures = []
+    if claim.picture:
+        caption = f"{claim.statement}: {claim.verdict}. {claim.reason}."
+        pictures.append([views.Picture(claim.picture, caption)])
+    rows = [["repeat", claim.repeat]]
+    return ResultPart(claim.name, rows=rows, pictures=pictures)
 
 
 def describe_claim(claim: AnyClaim, config: SceneConfig) -> str:
@@ -217,28 +224,39 @@ def describe_claim(claim: AnyClaim, config: SceneConfig) -> str:
             f"{pictures} that the ranges span: {subject}"
         )
     if isinstance(claim, ChangeClaim):
-        answer = "the same"
-        if claim.claim == "must_change":
-            answer = "something else"
-        changes = {**SweepConfig.blind_changes, **SweepConfig.harmless_changes}
-        return (
-            f"{model} says {answer} when {changes[claim.when]}, in at least "
-            f"{wording.percent(claim.at_least)} of pictures: {subject}"
-        )
+        return f"{model} says {_describe_expected_change(claim)}: {subject}"
     if isinstance(claim, NoWorseClaim):
-        points = f"{wording.format_number(claim.points)} points"
-        other = wording.shorten_name(claim.than)
-        return (
-            f"{model} is right at most {points} less often than {other} "
-            f"on the same pictures of {subject}"
-        )
-    epsilon = getattr(config, "epsilon", None)
-    budget = ""
-    if isinstance(epsilon, float):
-        budget = f" within {wording.format_number(epsilon)}"
-    elif epsilon is not None:  # multiple budgets, as a text with commas
-        budget = f" within {epsilon}"
+        comparison = _describe_expected_difference(claim)
+        return f"{model} is right {comparison} on the same pictures of {subject}"
+    budget = _describe_epsilon(config)
     return f"no search finds a picture that {model} gets wrong: {subject}{budget}"
+
+
+def _describe_expected_difference(claim: NoWorseClaim) -> str:
+    """Describe by how much a model may be right less often than another one."""
+    points = f"{wording.format_number(claim.points)} points"
+    return f"at most {points} less often than {wording.shorten_name(claim.than)}"
+
+
+def _describe_expected_change(claim: ChangeClaim) -> str:
+    """Describe what a model has to say under a change, and in how many pictures."""
+    answer = "the same"
+    if claim.claim == "must_change":
+        answer = "something else"
+    changes = {**SweepConfig.blind_changes, **SweepConfig.harmless_changes}
+    return (
+        f"{answer} when {changes[claim.when]}, in at least "
+        f"{wording.percent(claim.at_least)} of pictures"
+    )
+
+
+def _describe_epsilon(config: SceneConfig) -> str:
+    """Return the budget of a search, to end a sentence; empty without one."""
+    epsilon = getattr(config, "epsilon", None)
+    if isinstance(epsilon, float):
+        return f" within {wording.format_number(epsilon)}"
+    # several budgets are a text with commas
+    return "" if epsilon is None else f" within {epsilon}"
 
 
 def describe_fraction(
@@ -298,7 +316,7 @@ def describe_difference(
     if not n_pictures:
         return "no picture"
     pictures = wording.format_count(n_pictures, "picture")
-    # percentage points
+    # percentage points, as the difference is
     bounds = " to ".join(f"{100.0 * bound:+.1f}" for bound in interval)
     points = 100.0 * (n_only_this - n_only_other) / n_pictures
     reason = (
@@ -344,13 +362,7 @@ def evaluate_search(
         return SearchVerdict(FAILED, _describe_wrong_clean(summary))
     # The status "found" means that the scene was verified.
     if summary.ending == "found" and verified is not None:
-        prediction = describe_wrong_prediction(summary.task, verified)
-        interval = wording.format_interval(verified.interval)
-        reason = (
-            f"a verified counterexample: wrong in {verified.successes} of "
-            f"{verified.trials} trials (interval {interval}){prediction}"
-        )
-        return SearchVerdict(FAILED, reason)
+        return SearchVerdict(FAILED, _describe_verified(summary.task, verified))
     if summary.is_unfinished:
         return SearchVerdict(UNDECIDED, INTERRUPTED_REASON, Cause.INTERRUPTED)
     if verified is not None and verified.successes:
@@ -359,17 +371,36 @@ def evaluate_search(
             f"{verified.trials} trials: it depends on the noise"
         )
         return SearchVerdict(UNDECIDED, reason)
-    # Without a time limit, a search that makes fewer steps has ended by itself.
-    max_steps = config.steps
-    has_time_limit = config.seconds is not None
-    if has_time_limit and max_steps is not None and summary.steps < max_steps:
-        reason = f"{OUT_OF_TIME_REASON} after {summary.steps} of {max_steps} steps"
+    if _was_cut_short(summary, config):
+        reason = f"{OUT_OF_TIME_REASON} after {summary.steps} of {config.steps} steps"
         return SearchVerdict(UNDECIDED, reason, Cause.OUT_OF_TIME)
+    return SearchVerdict(HELD, _describe_unbroken(summary))
+
+
+def _was_cut_short(summary: workbench.AttackSummary, config: AttackConfig) -> bool:
+    """Return whether a time limit ended a search before it made all of its steps."""
+    # Without a time limit, a search that makes fewer steps has ended by itself.
+    if config.seconds is None or config.steps is None:
+        return False
+    return summary.steps < config.steps
+
+
+def _describe_verified(task: str, verified: results.VerifiedRate) -> str:
+    """Describe that a search has found a verified counterexample."""
+    prediction = describe_wrong_prediction(task, verified)
+    interval = wording.format_interval(verified.interval)
+    return (
+        f"a verified counterexample: wrong in {verified.successes} of "
+        f"{verified.trials} trials (interval {interval}){prediction}"
+    )
+
+
+def _describe_unbroken(summary: workbench.AttackSummary) -> str:
+    """Describe that a search has found nothing, and how long it was."""
     # The baseline is a random search with as many renders.
     baseline = "" if summary.baseline is None else ", nor by as many random renders"
     steps = wording.format_count(summary.steps, "step")
-    reason = f"not broken by {steps} of {summary.policy}{baseline}; this is no proof"
-    return SearchVerdict(HELD, reason)
+    return f"not broken by {steps} of {summary.policy}{baseline}; this is no proof"
 
 
 def _describe_wrong_clean(summary: workbench.AttackSummary) -> str:
@@ -435,22 +466,40 @@ def describe_trials(
         interval_text = wording.format_interval(interval)
         reason = f"right in {n_right} of {n_right} {trials} (interval {interval_text})"
     else:
-        lower, upper = interval  # of right trials
-        interval_text = wording.format_interval((1.0 - upper, 1.0 - lower))
-        reason = (
-            f"wrong in {n_wrong} of {n_right + n_wrong} {trials} "
-            f"(interval {interval_text})"
-        )
+        total = f"{n_right + n_wrong} {trials}"
+        reason = _describe_wrong_trials(n_wrong, total, interval)
         reason += f": {outcomes}" if outcomes else f", {wording.add_article(label)}"
     if verdict == UNDECIDED and n_right and n_wrong:
         cause = "conditions" if has_conditions else "noise"
         reason += f": it depends on the {cause}"
     if n_uncounted:
-        why = "the object is not to be seen"
-        if has_conditions:
-            why = "the clean scene is wrong, or the object not to be seen"
-        reason += f"; {n_uncounted} more are not counted, as {why}"
+        reason += _describe_further_uncounted(
+            n_uncounted, has_conditions=has_conditions
+        )
     return reason
+
+
+def _describe_wrong_trials(
+    n_wrong: int, total: str, interval: tuple[float, float]
+) -> str:
+    """Describe in how many trials the model is wrong.
+
+    Args:
+        n_wrong: number of these trials.
+        total: number of all trials, with what they are.
+        interval: interval of the fraction of right trials.
+    """
+    lower, upper = interval
+    interval_text = wording.format_interval((1.0 - upper, 1.0 - lower))
+    return f"wrong in {n_wrong} of {total} (interval {interval_text})"
+
+
+def _describe_further_uncounted(n_uncounted: int, *, has_conditions: bool) -> str:
+    """Describe how many trials do not count in addition to others, to end a sentence."""
+    why = "the object is not to be seen"
+    if has_conditions:
+        why = "the clean scene is wrong, or the object not to be seen"
+    return f"; {n_uncounted} more are not counted, as {why}"
 
 
 def _describe_uncounted(n_uncounted: int, *, has_conditions: bool) -> str:
@@ -522,18 +571,23 @@ def list_claims(result: SuiteResult) -> Iterator[views.Claim]:
             f"{tested.name}: that {tested.statement} is {tested.verdict}: "
             f"{tested.reason}."
         )
-        kind = "measured"
-        if tested.verdict == UNDECIDED:
-            kind = "nothing claimed"
-        elif tested.kind in ("not_broken", "counterexample"):
-            kind = "found" if tested.verdict == FAILED else "not found"
-        else:
+        kind = _find_claim_kind(tested)
+        if kind == "measured":
             confidence = wording.percent(result.confidence)
             text += (
                 f" Each bound of the interval is a confidence sequence at {confidence} "
                 "and not a bound of Clopper and Pearson."
             )
         yield views.Claim(kind=kind, statement=text, extent=None)
+
+
+def _find_claim_kind(tested: ClaimResult) -> str:
+    """Return what kind of claim a tested claim is in a report."""
+    if tested.verdict == UNDECIDED:
+        return "nothing claimed"
+    if tested.kind in ("not_broken", "counterexample"):
+        return "found" if tested.verdict == FAILED else "not found"
+    return "measured"
 
 
 SARIF_SCHEMA = "https://docs.oasis-open.org/sarif/sarif/v2.1.0/errata01/os/schemas/sarif-schema-2.1.0.json"
@@ -560,15 +614,7 @@ def format_junit(result: SuiteResult) -> str:
     Failed claims are failures, and undecided claims are errors. Claims that are failed
     or undecided as expected count as skipped, so that they do not break a build.
     """
-    verdicts = [(claim.verdict, claim.accepted) for claim in result.claims]
-    n_skipped = sum(accepted and verdict != HELD for verdict, accepted in verdicts)
-    attributes = {
-        "tests": str(len(verdicts)),
-        "failures": str(verdicts.count((FAILED, False))),
-        "errors": str(verdicts.count((UNDECIDED, False))),
-        "skipped": str(n_skipped),
-        "time": f"{result.seconds['total']:.3f}",
-    }
+    attributes = _count_test_cases(result)
     root = ElementTree.Element("testsuites", {"name": "advsearch", **attributes})
     suite = ElementTree.SubElement(
         root, "testsuite", {"name": _escape_xml(result.title), **attributes}
@@ -585,6 +631,19 @@ def format_junit(result: SuiteResult) -> str:
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{xml}\n'
 
 
+def _count_test_cases(result: SuiteResult) -> dict[str, str]:
+    """Return the counts and the time of a suite, as attributes of JUnit."""
+    verdicts = [(claim.verdict, claim.accepted) for claim in result.claims]
+    n_skipped = sum(accepted and verdict != HELD for verdict, accepted in verdicts)
+    return {
+        "tests": str(len(verdicts)),
+        "failures": str(verdicts.count((FAILED, False))),
+        "errors": str(verdicts.count((UNDECIDED, False))),
+        "skipped": str(n_skipped),
+        "time": f"{result.seconds['total']:.3f}",
+    }
+
+
 def _add_test_case(
     suite: ElementTree.Element, result: SuiteResult, claim: ClaimResult
 ) -> None:
@@ -595,19 +654,29 @@ def _add_test_case(
         result: result of the full suite.
         claim: result of the claim.
     """
-    case = ElementTree.SubElement(
-        suite,
-        "testcase",
-        {
-            "name": claim.name,
-            "classname": _escape_xml(f"{result.title}.{claim.kind}"),
-            "time": f"{claim.seconds:.3f}",
-        },
-    )
+    attributes = {
+        "name": claim.name,
+        "classname": _escape_xml(f"{result.title}.{claim.kind}"),
+        "time": f"{claim.seconds:.3f}",
+    }
+    case = ElementTree.SubElement(suite, "testcase", attributes)
     if claim.verdict == HELD:
         output = ElementTree.SubElement(case, "system-out")
         output.text = _escape_xml(f"{claim.statement}\n{claim.reason}")
-        return
+    else:
+        _add_outcome(case, result, claim)
+
+
+def _add_outcome(
+    case: ElementTree.Element, result: SuiteResult, claim: ClaimResult
+) -> None:
+    """Add to a test case of JUnit that its claim is not held, and why.
+
+    Args:
+        case: element of the test case.
+        result: result of the full suite.
+        claim: result of the claim.
+    """
     # An undecided claim is an "error".
     tag = "failure" if claim.verdict == FAILED else "error"
     if claim.accepted:  # its verdict is as expected
@@ -628,34 +697,44 @@ def format_sarif(result: SuiteResult) -> str:
     Results that are as expected have the state `unchanged`, all others `new`.
     """
     kinds = list(dict.fromkeys(claim.kind for claim in result.claims))
-    rules = [
-        {
-            "id": kind,
-            "shortDescription": {"text": KIND_DESCRIPTIONS[kind]},
-            "defaultConfiguration": {"level": "error"},
-        }
-        for kind in kinds
-    ]
-    suite_lines = list[str]()
-    if Path(result.suite).is_file():
-        suite_lines = Path(result.suite).read_text("utf-8").splitlines()
+    suite_lines = _read_suite_lines(result)
     sarif_results = [
         _sarif_result(result, claim, kinds.index(claim.kind), suite_lines)
         for claim in result.claims
         if claim.verdict != HELD
     ]
+    rules = [_make_sarif_rule(kind) for kind in kinds]
     driver = {"name": "advsearch", "version": __version__, "rules": rules}
-    invocation = {
-        "executionSuccessful": not result.is_unfinished,
-        "commandLine": result.command_line or "",
-    }
     run = {
         "tool": {"driver": driver},
-        "invocations": [invocation],
+        "invocations": [_make_sarif_invocation(result)],
         "results": sarif_results,
     }
     log = {"$schema": SARIF_SCHEMA, "version": "2.1.0", "runs": [run]}
     return json.dumps(log, indent=2, ensure_ascii=False) + "\n"
+
+
+def _make_sarif_invocation(result: SuiteResult) -> dict[str, object]:
+    """Return what SARIF states about the run: its command, and whether it has ended."""
+    return {
+        "executionSuccessful": not result.is_unfinished,
+        "commandLine": result.command_line or "",
+    }
+
+
+def _read_suite_lines(result: SuiteResult) -> list[str]:
+    """Return the lines of the suite's file; none if it does not exist any more."""
+    path = Path(result.suite)
+    return path.read_text("utf-8").splitlines() if path.is_file() else []
+
+
+def _make_sarif_rule(kind: str) -> dict[str, object]:
+    """Return the SARIF rule of a kind of claims."""
+    return {
+        "id": kind,
+        "shortDescription": {"text": KIND_DESCRIPTIONS[kind]},
+        "defaultConfiguration": {"level": "error"},
+    }
 
 
 def _sarif_result(
@@ -717,20 +796,26 @@ def format_markdown(result: SuiteResult) -> str:
         "",
         _escape_markdown(describe_suite(result)),
         "",
-        _format_row(TABLE_HEADS),
-        _format_row(["---"] * len(TABLE_HEADS)),
-        *map(_format_row, make_table_rows(result)),
+        *_format_claim_table(result),
         "",
         ", ".join(fact_texts),
     ]
-    commands = [
-        claim.repeat
-        for claim in result.claims
-        if claim.verdict != HELD and claim.repeat
-    ]
+    commands = _list_repeating_commands(result.claims)
     if commands:
         lines += ["", "```sh", *commands, "```"]
     return "\n".join(lines) + "\n"
+
+
+def _list_repeating_commands(claims: Sequence[ClaimResult]) -> list[str]:
+    """Return the commands that repeat the claims that are not held."""
+    return [claim.repeat for claim in claims if claim.verdict != HELD and claim.repeat]
+
+
+def _format_claim_table(result: SuiteResult) -> list[str]:
+    """Return the lines of a Markdown table of the claims."""
+    rule = ["---"] * len(TABLE_HEADS)  # the line that Markdown has under heads
+    rows = (TABLE_HEADS, rule, *make_table_rows(result))
+    return [_format_row(row) for row in rows]
 
 
 def _picture_path(result: SuiteResult, claim: ClaimResult) -> str:

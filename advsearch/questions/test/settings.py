@@ -325,23 +325,26 @@ class Suite(_YamlModel):
             InputError: a setting is unknown, invalid, or belongs to the suite.
         """
         claim = self.claims[name]
-        for where, claim_settings in (
-            ("settings", self.settings),
-            (f"claims.{name}.settings", claim.settings),
-        ):
-            # For example the seed: all claims of a suite have the same.
-            for known in claim_settings:
-                if known in SUITE_ONLY_SETTINGS:
-                    raise InputError(
-                        f"{where}: {known} is a setting of the full suite; leave it "
-                        "out there"
-                    )
+        _check_no_suite_setting("settings", self.settings)
+        _check_no_suite_setting(f"claims.{name}.settings", claim.settings)
         changed = {key: value for key, value in changes.items() if value is not None}
         merged = {**self.settings, **claim.settings, "seed": self.seed, **changed}
         try:
             return claim.config_type(**merged)
         except InputError as error:
             raise InputError(f"claims.{name}: {error}") from None
+
+
+def _check_no_suite_setting(where: str, claim_settings: Mapping[str, object]) -> None:
+    """Raise an error if settings of claims have one that belongs to the suite.
+
+    For example the seed: all claims of a suite have the same.
+    """
+    for known in claim_settings:
+        if known in SUITE_ONLY_SETTINGS:
+            raise InputError(
+                f"{where}: {known} is a setting of the full suite; leave it out there"
+            )
 
 
 def read_suite(path: str | Path) -> Suite:
@@ -385,21 +388,17 @@ def _describe_error(error: Any) -> str:
     # The location is a path of names, such as ["claims", "right-around", "at_least"].
     # pydantic adds the kind of the claim to it, which is left out.
     location = [str(part) for part in error["loc"] if part not in CLAIM_KINDS]
-    got = settings.format_value(error["input"])
     # pydantic's location of a wrong key of a mapping ends with "[key]". Keys are names
     # of claims: YAML has read a name such as 12 as a number.
     is_wrong_key = location[-1] == "[key]"
     if is_wrong_key:
         return (
             f"{location[0]}: expected names of small letters, digits and hyphens, got "
-            f"{got}; put it in quotes"
+            f"{settings.format_value(error['input'])}; put it in quotes"
         )
     # The field `claim`, which states the kind of a claim, is missing or wrong.
     if kind.startswith("union_tag"):
         location.append("claim")
-        got = "nothing"
-        if kind != "union_tag_not_found":
-            got = settings.format_value(error["ctx"]["tag"])
     where = ".".join(location)
     name = location[-1]
     if kind == "extra_forbidden":
@@ -407,13 +406,21 @@ def _describe_error(error: Any) -> str:
         return f"{where}: {_describe_unknown_name(name, in_claim=len(location) > 2)}"
     if kind == "value_error":
         return f"{where}: {str(error['msg']).removeprefix('Value error, ')}"
-    if kind == "missing":
-        got = "nothing"
-    elif kind == "too_short":  # an empty mapping of claims
-        got = "none"
     # If the name is not that of a setting, it is the name of a claim.
     expected = EXPECTED_VALUES.get(name, CLAIM_EXAMPLE)
-    return f"{where}: expected {expected}, got {got}"
+    return f"{where}: expected {expected}, got {_describe_input(error)}"
+
+
+def _describe_input(error: Any) -> str:
+    """Describe the value that an error of pydantic is about, or that there is none."""
+    kind = error["type"]
+    if kind in ("missing", "union_tag_not_found"):
+        return "nothing"
+    if kind == "too_short":  # an empty mapping of claims
+        return "none"
+    if kind.startswith("union_tag"):
+        return settings.format_value(error["ctx"]["tag"])
+    return settings.format_value(error["input"])
 
 
 def _describe_unknown_name(name: str, *, in_claim: bool) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import gc
 import io
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from pathlib import Path
@@ -83,22 +83,40 @@ def run_twins(context: RunContext[TwinsConfig], *, network: Any = None) -> Twins
     judges, warnings = load_judges(config, network)
     comparison = Comparison(context, judges)
     selection = comparison.select(listing.objects)
-    if listing.n_missing:
-        warnings.append(
-            f"{listing.n_missing} objects are in photographs that are not there; they "
-            "are left out."
-        )
-    warnings += selection.warnings
+    warnings += [*_warn_of_missing(listing.n_missing), *selection.warnings]
     measurements = context.open_measurements()
-
-    def make_result(rows: list[TwinRow]) -> TwinsResult:
-        # Tasks may have new remarks after they were calibrated in the comparison.
-        remarks = [remark for judge in judges for remark in judge.task.output_remarks]
-        return comparison.make_result(rows, [*warnings, *remarks])
-
     # `compare` looks up stored rows, and `collect` gathers stored and new ones.
     rows = comparison.compare(selection, measurements)
+    make_result = partial(_make_result_with_remarks, comparison, judges, warnings)
     return measurements.make_result_of_rows(rows, make_result)
+
+
+def _warn_of_missing(n_missing: int) -> list[str]:
+    """Return a warning if photographs of some objects do not exist."""
+    if not n_missing:
+        return []
+    return [
+        f"{n_missing} objects are in photographs that are not there; they are left out."
+    ]
+
+
+def _make_result_with_remarks(
+    comparison: Comparison,
+    judges: Sequence[ModelJudge],
+    warnings: Sequence[str],
+    rows: list[TwinRow],
+) -> TwinsResult:
+    """Make the result of some rows, with the remarks of the tasks as warnings, too.
+
+    Args:
+        comparison: the comparison, which has made the rows.
+        judges: judges of the models.
+        warnings: warnings of the run.
+        rows: rows of all objects and models.
+    """
+    # Tasks may have new remarks after they were calibrated in the comparison.
+    remarks = [remark for judge in judges for remark in judge.task.output_remarks]
+    return comparison.make_result(rows, [*warnings, *remarks])
 
 
 class ModelJudge:
@@ -142,14 +160,7 @@ class ModelJudge:
             (judgement,) = workbench.judge_images(
                 self.task, output, rounded[None], [truth]
             )
-            yield TwinPrediction(
-                surroundings=name,
-                label=judgement.prediction.label,
-                probability=judgement.prediction.probability,
-                right=judgement.right,
-                margin=judgement.margin,
-                payload=judgement.payload,
-            )
+            yield _make_twin_prediction(name, judgement)
 
     def _calibrate_once(self, twin: rendering.Twin, truth: Any) -> None:
         """Calibrate a task that needs it, with the first photograph.
@@ -172,6 +183,20 @@ class ModelJudge:
             raise InputError(f"task {self.task.name}: {self.task.ambiguity_message}")
 
 
+def _make_twin_prediction(
+    surroundings: str, judgement: tasks.Judgement
+) -> TwinPrediction:
+    """Make the stored prediction about an image with some surroundings."""
+    return TwinPrediction(
+        surroundings=surroundings,
+        label=judgement.prediction.label,
+        probability=judgement.prediction.probability,
+        right=judgement.right,
+        margin=judgement.margin,
+        payload=judgement.payload,
+    )
+
+
 def load_judges(
     config: TwinsConfig, network: Any
 ) -> tuple[list[ModelJudge], list[str]]:
@@ -190,24 +215,11 @@ def load_judges(
     """
     task = workbench.make_task(config.task)
     network_of_frame = network if isinstance(network, Mapping) else {}
-    networks: list[Any] = [network]
-    if network is None:
-        networks = list(settings.split_names(config.model))
-    elif network_of_frame:
-        # Each model is loaded once, though it predicts many frames.
-        networks = list(dict.fromkeys(network_of_frame.values()))
+    networks = _list_networks(config, network)
     # The function's type is for `SceneConfig`, which has the same settings of models.
     scene_config: Any = config
     models, warnings = workbench.load_models(networks, task, scene_config)
-    if len({model.input_size for model in models}) > 1:
-        sizes = ", ".join(
-            f"{model.name} {model.input_size[1]} x {model.input_size[0]}"
-            for model in models
-        )
-        raise InputError(
-            f"model: expected models that take pictures of one size, got {sizes}; "
-            "compare them one by one"
-        )
+    _check_input_sizes(models)
     if not network_of_frame:
         return [ModelJudge(task, model, {}) for model in models], warnings
     # `models` are in the order of `networks`.
@@ -217,6 +229,29 @@ def load_judges(
     }
     # The first model predicts frames that the mapping does not have.
     return [ModelJudge(task, models[0], model_of_frame)], warnings
+
+
+def _list_networks(config: TwinsConfig, network: Any) -> list[Any]:
+    """Return the models to load; arguments as for `load_judges`."""
+    if network is None:
+        return list(settings.split_names(config.model))
+    if isinstance(network, Mapping) and network:
+        # Each model is loaded once, though it predicts many frames.
+        return list(dict.fromkeys(network.values()))
+    return [network]
+
+
+def _check_input_sizes(models: Sequence[Model]) -> None:
+    """Raise an error if models take images of different sizes."""
+    if len({model.input_size for model in models}) > 1:
+        sizes = ", ".join(
+            f"{model.name} {model.input_size[1]} x {model.input_size[0]}"
+            for model in models
+        )
+        raise InputError(
+            f"model: expected models that take pictures of one size, got {sizes}; "
+            "compare them one by one"
+        )
 
 
 class Comparison:
@@ -276,11 +311,35 @@ class Comparison:
         candidates = {
             number: item for number, item in enumerate(objects) if is_frame(item.frame)
         }
-        visible = {
+        visible = self._select_visible(candidates)
+        windows = self._choose_windows(visible)
+        if not windows:
+            raise InputError(
+                "photographs: no object is left; check `frames` and `visible`"
+            )
+        warnings = self._describe_left_out(
+            n_hidden=len(candidates) - len(visible),
+            n_outside=len(visible) - len(windows),
+        )
+        return Selection(objects, windows, warnings)
+
+    def _select_visible(
+        self, candidates: Mapping[int, PhotographedObject]
+    ) -> dict[int, PhotographedObject]:
+        """Return the objects that are not mostly hidden, by their numbers."""
+        return {
             number: item
             for number, item in candidates.items()
             if not self._is_hidden(item)
         }
+
+    def _choose_windows(
+        self, visible: Mapping[int, PhotographedObject]
+    ) -> dict[int, rendering.PhotoWindow]:
+        """Return the windows of visible objects by their numbers, and check their labels.
+
+        Objects that are out of view, or tiny, have none.
+        """
         assets: dict[Path, Any] = {}
         checked_labels: set[tuple[str, str]] = set()
         windows: dict[int, rendering.PhotoWindow] = {}
@@ -296,15 +355,7 @@ class Comparison:
             window = self._choose_window(item, assets[item.mesh])
             if window is not None:
                 windows[number] = window
-        if not windows:
-            raise InputError(
-                "photographs: no object is left; check `frames` and `visible`"
-            )
-        warnings = self._describe_left_out(
-            n_hidden=len(candidates) - len(visible),
-            n_outside=len(visible) - len(windows),
-        )
-        return Selection(objects, windows, warnings)
+        return windows
 
     def _is_hidden(self, item: PhotographedObject) -> bool:
         """Return whether less of an object is visible than `visible` requires.
@@ -396,28 +447,39 @@ class Comparison:
         # the environment is made.
         layers = self._render_layers(selection, missing)
         gc.collect()
-        renderer = None  # not used if all rows are stored
-        if missing:
-            renderer = self._make_renderer(
-                rendering.SurroundedRenderer,
-                self._config.environment_name,
-                selection,
-                missing,
-            )
+        renderer = self._make_surrounded_renderer(selection, missing)
         for number in numbers:
             layer = layers.pop(number, None)  # None if the rows are stored
-            # The twin is rendered once for all models, and not at all if all rows are
-            # stored.
-            make_twin = cache(
-                partial(self._make_twin, number, selection, layer, renderer)
+            make_twin = partial(self._make_twin, number, selection, layer, renderer)
+            yield from self._compare_object_by_model(
+                number, selection, make_twin, measurements
             )
-            for index, judge in enumerate(self._judges):
-                yield measurements.get_or_measure_row(
-                    make_row_name(number, index),
-                    TwinRow,
-                    partial(self._compare_object, number, selection, make_twin, judge),
-                )
             self._context.progress.advance(1)
+
+    def _compare_object_by_model(
+        self,
+        number: int,
+        selection: Selection,
+        make_twin: Callable[[], rendering.Twin],
+        measurements: Any,
+    ) -> Iterator[TwinRow]:
+        """Yield the rows of one object, for each model.
+
+        Args:
+            number: number of the object.
+            selection: all selected objects.
+            make_twin: function that renders the images of the object.
+            measurements: stored rows of the run.
+        """
+        # The twin is rendered once for all models, and not at all if all rows are
+        # stored.
+        make_shared_twin = cache(make_twin)
+        for index, judge in enumerate(self._judges):
+            measure = partial(
+                self._compare_object, number, selection, make_shared_twin, judge
+            )
+            row_name = make_row_name(number, index)
+            yield measurements.get_or_measure_row(row_name, TwinRow, measure)
 
     def _is_stored(self, number: int, measurements: Any) -> bool:
         """Return whether the rows of an object are stored for all models."""
@@ -443,16 +505,42 @@ class Comparison:
             selection,
             numbers,
         )
-        layers = {}
-        for number in numbers:
-            item = selection.objects[number]
-            window = selection.window_by_row_number[number]
-            photograph = self._load_photograph(item.photograph)
-            layers[number] = renderer.render(
-                item, photograph, window, self._size, number
-            )
-            self.n_renders += 1
-        return layers
+        return {
+            number: self._render_layer(renderer, selection, number)
+            for number in numbers
+        }
+
+    def _render_layer(
+        self, renderer: Any, selection: Selection, number: int
+    ) -> rendering.Layer:
+        """Render the object with some number into its photograph, and count the render.
+
+        Args:
+            renderer: `LayerRenderer` of the object's mesh.
+            selection: all selected objects and their windows.
+            number: number of the object.
+        """
+        item = selection.objects[number]
+        window = selection.window_by_row_number[number]
+        photograph = self._load_photograph(item.photograph)
+        layer: rendering.Layer = renderer.render(
+            item, photograph, window, self._size, number
+        )
+        self.n_renders += 1
+        return layer
+
+    def _make_surrounded_renderer(
+        self, selection: Selection, numbers: Sequence[int]
+    ) -> Any:
+        """Make the renderer of one mesh in the environment; None without objects."""
+        if not numbers:  # all rows are stored
+            return None
+        return self._make_renderer(
+            rendering.SurroundedRenderer,
+            self._config.environment_name,
+            selection,
+            numbers,
+        )
 
     def _make_renderer(
         self,
@@ -485,11 +573,7 @@ class Comparison:
         )
 
     def _make_twin(
-        self,
-        number: int,
-        selection: Selection,
-        layer: Any,
-        renderer: Any,
+        self, number: int, selection: Selection, layer: Any, renderer: Any
     ) -> rendering.Twin:
         """Render an object in the environment, and return all images of it.
 
@@ -501,16 +585,14 @@ class Comparison:
         """
         item = selection.objects[number]
         window = selection.window_by_row_number[number]
-        environment = self._config.environment_name
         render = renderer.render(item, window, number)
-        render_of_environment = {environment: render}
         self.n_renders += 1
         twin = rendering.make_twin(
             item,
             self._load_photograph(item.photograph),
             window,
             layer,
-            render_of_environment,
+            {self._config.environment_name: render},
             self._size,
         )
         self._save_images(number, twin)
@@ -596,6 +678,7 @@ class Comparison:
             factors = counting.explain_disagreement(rows, COMPOSED)
         overlaps = [row.overlap for row in rows if row.overlap is not None]
         worst = sorted(rows, key=rank_disagreement)[: self._config.pictures]
+        pairs = [TwinPair(row=row, pictures=list_images(row.number)) for row in worst]
         return self._context.result(
             TwinsResult,
             photographs=self._config.photographs,
@@ -605,9 +688,7 @@ class Comparison:
             overlap=float(np.median(overlaps)) if overlaps else None,
             low_overlaps=sum(overlap < LOW_OVERLAP for overlap in overlaps),
             factors=factors,
-            pairs=[
-                TwinPair(row=row, pictures=list_images(row.number)) for row in worst
-            ],
+            pairs=pairs,
             renders=self.n_renders,
             warnings=list(dict.fromkeys(warnings)),
         )
@@ -651,18 +732,26 @@ def parse_frames(text: str | None) -> Callable[[str], bool]:
             raise InputError(
                 f"frames: expected a name or a range such as 0:600, got {entry[:40]}"
             )
+    return partial(_is_frame_selected, names, ranges)
 
-    def is_used(frame: str) -> bool:
-        """Return whether the frame is selected by its name or its number."""
-        # "scene/000012" and "000012.png" both have the number "000012".
-        number = frame.rpartition("/")[2].partition(".")[0]
-        if frame in names or number in names:
-            return True
-        return number.isdecimal() and any(
-            first <= int(number) <= last for first, last in ranges
-        )
 
-    return is_used
+def _is_frame_selected(
+    names: Container[str], ranges: Sequence[tuple[int, int]], frame: str
+) -> bool:
+    """Return whether a frame is selected by its name or its number.
+
+    Args:
+        names: selected names and numbers.
+        ranges: first and last of each selected range of numbers.
+        frame: name of the frame.
+    """
+    # "scene/000012" and "000012.png" both have the number "000012".
+    number = frame.rpartition("/")[2].partition(".")[0]
+    if frame in names or number in names:
+        return True
+    return number.isdecimal() and any(
+        first <= int(number) <= last for first, last in ranges
+    )
 
 
 def make_row_name(number: int, model_index: int) -> str:

@@ -45,14 +45,6 @@ def _make_model_table(
         model: name of the model.
         task: title of the task.
     """
-    objects = sorted({row.object for row in rows})
-    conditions = sorted({row.condition for row in rows if row.condition})
-    groups: list[tuple[str, str, Sequence[TwinRow]]] = [("", "", rows)]
-    if len(objects) > 1:
-        for name in objects:
-            groups.append((name, "", [row for row in rows if row.object == name]))
-    for name in conditions:
-        groups.append(("", name, [row for row in rows if row.condition == name]))
     return [
         count_agreement(
             group,
@@ -63,9 +55,27 @@ def _make_model_table(
             condition=condition,
         )
         for name in surroundings
-        for object_name, condition, group in groups
-        if group
+        for object_name, condition, group in _list_groups(rows)
     ]
+
+
+def _list_groups(
+    rows: Sequence[TwinRow],
+) -> list[tuple[str, str, Sequence[TwinRow]]]:
+    """Return all rows, those of each object if there are several, and of each condition.
+
+    Each group is (object, condition, rows); an empty name stands for all. There are no
+    empty groups.
+    """
+    objects = sorted({row.object for row in rows})
+    conditions = sorted({row.condition for row in rows if row.condition})
+    groups: list[tuple[str, str, Sequence[TwinRow]]] = [("", "", rows)]
+    if len(objects) > 1:
+        for name in objects:
+            groups.append((name, "", [row for row in rows if row.object == name]))
+    for name in conditions:
+        groups.append(("", name, [row for row in rows if row.condition == name]))
+    return [group for group in groups if group[2]]
 
 
 def count_agreement(
@@ -318,13 +328,9 @@ def _cut_factor(
     edges = np.quantile(values, np.linspace(0.0, 1.0, N_PARTS + 1))
     if len(np.unique(edges)) <= N_PARTS:
         return
-    # The largest value is at the last edge, and belongs to the last part.
-    part_of_row = np.searchsorted(edges, values, side="right") - 1
-    part_of_row = np.clip(part_of_row, 0, N_PARTS - 1)
+    part_of_row = _assign_to_parts(values, edges)
     units = number_units(rows)
-    disagrees = np.array(
-        [row.photo.right != row.twin(surroundings).right for row in rows]
-    )
+    disagrees = _find_disagreements(rows, surroundings)
     for part in range(N_PARTS):
         inside = part_of_row == part
         yield FactorPart(
@@ -336,3 +342,20 @@ def _cut_factor(
             disagreeing=int(disagrees[inside].sum()),
             rate=estimate_rate(disagrees[inside], units[inside]),
         )
+
+
+def _assign_to_parts(
+    values: npt.NDArray[np.float64], edges: npt.NDArray[np.float64]
+) -> npt.NDArray[np.intp]:
+    """Return for each value (n,) the index of the part between two edges it lies in.
+
+    The last edge, which is the largest value, belongs to the last part.
+    """
+    part_of_value = np.searchsorted(edges, values, side="right") - 1
+    return np.clip(part_of_value, 0, N_PARTS - 1)
+
+
+def _find_disagreements(rows: Sequence[TwinRow], surroundings: str) -> BoolArray:
+    """Return whether only one of photograph and twin is right, for each row (n,)."""
+    disagrees = [row.photo.right != row.twin(surroundings).right for row in rows]
+    return np.array(disagrees)

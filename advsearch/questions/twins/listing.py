@@ -206,36 +206,80 @@ def _read_scene(scene: Path, models: Path, condition: str) -> Listing:
     infos: Mapping[str, Any] = {}
     if (scene / "scene_gt_info.json").is_file():
         infos = _read_json(scene / "scene_gt_info.json")
+    bop_scene = _BopScene(scene, models, condition, cameras, infos)
     objects: list[PhotographedObject] = []
     n_missing = 0
     for image, entries in truths.items():
-        where = f"{scene / GROUND_TRUTH}: image {image[:20]}"
+        image_objects = bop_scene.read_objects(image, entries)
+        # Data sets are often downloaded without all photographs.
+        if image_objects is None:
+            n_missing += len(entries)
+        else:
+            objects += image_objects
+    return Listing(objects, n_missing)
+
+
+@dataclass(frozen=True)
+class _BopScene:
+    """A scene of a data set in BOP's form.
+
+    Attributes:
+        directory: directory of the scene.
+        models: directory of the meshes.
+        condition: condition of all its photographs, such as "night"; or empty.
+        cameras: the camera of each image, by its number as text, unchecked.
+        infos: likewise, what `scene_gt_info.json` has about the image's objects.
+    """
+
+    directory: Path
+    models: Path
+    condition: str
+    cameras: Mapping[str, Any]
+    infos: Mapping[str, Any]
+
+    def read_objects(self, image: str, entries: Any) -> list[PhotographedObject] | None:
+        """Read the objects of an image; None if its photograph is missing.
+
+        Args:
+            image: number of the image, as text.
+            entries: what the ground truth has about it, unchecked.
+        """
+        where = f"{self.directory / GROUND_TRUTH}: image {image[:20]}"
         is_number = image.isdecimal() and len(image) <= MAX_IMAGE_DIGITS
         if not is_number or not _is_rows(entries):
             raise errors.FileFormatError(f"{where}: expected a list of objects")
-        photograph = _find_photograph(scene, int(image))
-        # Data sets are often downloaded without all photographs.
+        photograph = _find_photograph(self.directory, int(image))
         if photograph is None:
-            n_missing += len(entries)
-            continue
-        shared: dict[str, Any] = {
+            return None
+        shared = self._read_shared_values(image, photograph, where)
+        infos = self.infos.get(image)
+        return [
+            PhotographedObject(
+                **shared,
+                **_read_bop_silhouette(self.directory, image, index, infos),
+                **_read_bop_object(where, entry, self.models),
+            )
+            for index, entry in enumerate(entries)
+        ]
+
+    def _read_shared_values(
+        self, image: str, photograph: Path, where: str
+    ) -> dict[str, Any]:
+        """Return the fields that all objects of an image share.
+
+        Args:
+            image: number of the image, as text.
+            photograph: its photograph.
+            where: location in the ground truth, for messages.
+        """
+        return {
             "photograph": photograph,
-            "frame": f"{scene.name}/{image}",
-            "camera": _read_bop_camera(scene, cameras, image),
+            "frame": f"{self.directory.name}/{image}",
+            "camera": _read_bop_camera(self.directory, self.cameras, image),
             "unit": "mm",
-            "condition": condition,
+            "condition": self.condition,
             "where": where,
         }
-        image_infos = infos.get(image)
-        for index, entry in enumerate(entries):
-            objects.append(
-                PhotographedObject(
-                    **shared,
-                    **_read_bop_silhouette(scene, image, index, image_infos),
-                    **_read_bop_object(where, entry, models),
-                )
-            )
-    return Listing(objects, n_missing)
 
 
 def _read_bop_silhouette(
@@ -277,12 +321,17 @@ def _read_bop_object(
     mesh = models / f"{name}.ply"
     if not mesh.is_file():
         raise errors.FileFormatError(f"{where}: expected the mesh {mesh}, got none")
+    return {"object": name, "mesh": mesh, "pose": _read_bop_pose(entry, where)}
+
+
+def _read_bop_pose(entry: Mapping[str, Any], where: str) -> Float64Array:
+    """Return the pose (4, 4) of an entry of the ground truth: mesh to camera."""
     rotation = _to_numbers(entry.get("cam_R_m2c"), f"{where}: cam_R_m2c", 9)
     translation = _to_numbers(entry.get("cam_t_m2c"), f"{where}: cam_t_m2c", 3)
     matrix = np.eye(4)
     matrix[:3, :3] = rotation.reshape(3, 3)
     matrix[:3, 3] = translation
-    return {"object": name, "mesh": mesh, "pose": _check_pose(matrix, where)}
+    return _check_pose(matrix, where)
 
 
 def _read_bop_camera(scene: Path, cameras: Mapping[str, Any], image: str) -> Pinhole:
@@ -359,23 +408,7 @@ def _read_rows(path: Path) -> list[dict[str, Any]]:
 
     A row is a mapping. Rows of CSV have texts as values, and no keys for empty cells.
     """
-    suffix = path.suffix.lower()
-    is_yaml = suffix not in (".csv", ".json")  # ".yaml" or ".yml"
-    text = stored_files.read_existing_text(
-        path, "a list of photographs", MAX_YAML_BYTES if is_yaml else MAX_JSON_BYTES
-    )
-    rows: Any
-    if suffix == ".csv":
-        rows = [
-            {key: value for key, value in row.items() if value}
-            for row in csv.DictReader(io.StringIO(text))
-        ]
-    elif suffix == ".json":
-        rows = stored_files.parse_text(path, text, "JSON", stored_files.parse_json)
-    else:
-        from advsearch.extend import workbench  # imports torch
-
-        rows = stored_files.parse_text(path, text, "YAML", workbench.parse_yaml)
+    rows = _parse_list(path)
     if isinstance(rows, dict):  # JSON or YAML with the list under this key
         rows = rows.get("photographs")
     if not _is_rows(rows):
@@ -383,6 +416,25 @@ def _read_rows(path: Path) -> list[dict[str, Any]]:
             f"{path}: expected a list with a row for each object in a photograph"
         )
     return list(rows)
+
+
+def _parse_list(path: Path) -> Any:
+    """Return the content of a list of photographs, in CSV, JSON or YAML, unchecked."""
+    suffix = path.suffix.lower()
+    is_yaml = suffix not in (".csv", ".json")  # ".yaml" or ".yml"
+    text = stored_files.read_existing_text(
+        path, "a list of photographs", MAX_YAML_BYTES if is_yaml else MAX_JSON_BYTES
+    )
+    if suffix == ".csv":
+        return [
+            {key: value for key, value in row.items() if value}
+            for row in csv.DictReader(io.StringIO(text))
+        ]
+    if suffix == ".json":
+        return stored_files.parse_text(path, text, "JSON", stored_files.parse_json)
+    from advsearch.extend import workbench  # imports torch
+
+    return stored_files.parse_text(path, text, "YAML", workbench.parse_yaml)
 
 
 def _read_row(row: Mapping[str, Any], path: Path, where: str) -> PhotographedObject:
@@ -399,10 +451,7 @@ def _read_row(row: Mapping[str, Any], path: Path, where: str) -> PhotographedObj
     _check_keys(row, where)
     photograph = _get_file(row, "photograph", path, where)
     mesh = _get_file(row, "object", path, where)
-    # A pose is a matrix (3, 4) or (4, 4). The last row of the latter is 0, 0, 0, 1.
-    numbers = _to_numbers(row["pose"], f"{where}: pose", 12, 16)
-    matrix = np.eye(4)
-    matrix[:3] = numbers[:12].reshape(3, 4)
+    matrix = _read_matrix(row, where)
     unit = str(row.get("unit", "m"))
     if unit not in ("mm", "cm", "m", "in"):
         raise errors.FileFormatError(f"{where}: unit: expected mm, cm, m or in")
@@ -419,6 +468,17 @@ def _read_row(row: Mapping[str, Any], path: Path, where: str) -> PhotographedObj
         mask=_get_file(row, "mask", path, where) if "mask" in row else None,
         where=where,
     )
+
+
+def _read_matrix(row: Mapping[str, Any], where: str) -> Float64Array:
+    """Return the pose of a row as a matrix (4, 4), which may not be valid.
+
+    It is a matrix (3, 4) or (4, 4) in the row. The last row of the latter is 0, 0, 0, 1.
+    """
+    numbers = _to_numbers(row["pose"], f"{where}: pose", 12, 16)
+    matrix = np.eye(4)
+    matrix[:3] = numbers[:12].reshape(3, 4)
+    return matrix
 
 
 def _check_keys(row: Mapping[str, Any], where: str) -> None:
@@ -483,6 +543,20 @@ def _read_row_camera(
 
     file = _get_file(row, "camera", path, where)
     model = workbench.read_camera(str(file))
+    return _scale_to_photograph(model, photograph, where)
+
+
+def _scale_to_photograph(model: Any, photograph: Path, where: str) -> Pinhole:
+    """Return the pinhole of a camera model, in pixels of a photograph.
+
+    Args:
+        model: the camera model; its lengths are fractions of the width and the height.
+        photograph: path of the photograph.
+        where: the list and the row, for messages.
+
+    Raises:
+        InputError: the lens has a distortion.
+    """
     # These are fractions of the width and the height.
     lens = {key: model.intrinsic_by_name[key] for key in ("fx", "fy", "cx", "cy")}
     distortion = [
@@ -537,11 +611,7 @@ def _check_pose(matrix: Float64Array, where: str) -> Float64Array:
     camera.
     """
     rotation = matrix[:3, :3]
-    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if error > MAX_ROTATION_ERROR or np.linalg.det(rotation) < 0.0:
-        raise errors.FileFormatError(
-            f"{where}: expected a rotation, got a matrix that stretches or mirrors"
-        )
+    _check_rotation(rotation, where)
     if matrix[2, 3] <= 0.0:
         raise errors.FileFormatError(
             f"{where}: expected an object before the camera (z > 0), got z = "
@@ -551,6 +621,15 @@ def _check_pose(matrix: Float64Array, where: str) -> Float64Array:
     pose: Float64Array = matrix.copy()
     pose[:3, :3] = left @ right
     return np.asarray(pose)
+
+
+def _check_rotation(rotation: Float64Array, where: str) -> None:
+    """Raise an error if a matrix (3, 3) is not close to a rotation."""
+    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if error > MAX_ROTATION_ERROR or np.linalg.det(rotation) < 0.0:
+        raise errors.FileFormatError(
+            f"{where}: expected a rotation, got a matrix that stretches or mirrors"
+        )
 
 
 def _make_pinhole(numbers: Float64Array, where: str) -> Pinhole:

@@ -128,19 +128,12 @@ def choose_window(
     """
     low = positions.min(axis=0)
     high = positions.max(axis=0)
-    photo_height, photo_width = photo_size
-    longer = float((high - low).max())
-    is_left_or_above = high[0] <= 0.0 or high[1] <= 0.0
-    is_right_or_below = low[0] >= photo_width or low[1] >= photo_height
-    if is_left_or_above or is_right_or_below or longer < MIN_SILHOUETTE:
+    box_size = high - low
+    longer_side = float(box_size.max())
+    if _is_out_of_view(low, high, photo_size) or longer_side < MIN_SILHOUETTE:
         return None
-    # From here on, sizes are (width, height), as positions are (x, y).
-    model_width_height = np.array([model_size[1], model_size[0]], np.float64)
-    widened = high - low + 2.0 * margin * longer
-    # the smallest size with the model's aspect ratio that contains the widened box
-    size = model_width_height * float((widened / model_width_height).max())
-    size *= min(1.0, photo_width / size[0], photo_height / size[1])  # not larger
-    width, height = (max(1, math.floor(side)) for side in size)
+    photo_height, photo_width = photo_size
+    width, height = _compute_window_size(box_size, photo_size, model_size, margin)
     center = (low + high) / 2.0
     return PhotoWindow(
         _center_within(float(center[0]), width, photo_width),
@@ -148,6 +141,48 @@ def choose_window(
         width,
         height,
     )
+
+
+def _compute_window_size(
+    box_size: Float64Array,
+    photo_size: tuple[int, int],
+    model_size: tuple[int, int],
+    margin: float,
+) -> tuple[int, int]:
+    """Return width and height of the window around a bounding box, in pixels.
+
+    Args:
+        box_size: (width, height) of the box.
+        photo_size: (height, width) of the photograph.
+        model_size: (height, width) of the images that the model takes.
+        margin: width that is added on each side, as a fraction of the box's longer
+            side.
+    """
+    photo_height, photo_width = photo_size
+    model_height, model_width = model_size
+    # All sizes from here on are (width, height), as that of the box is.
+    model_shape = np.array([model_width, model_height], np.float64)
+    widened = box_size + 2.0 * margin * float(box_size.max())
+    # the smallest size with the model's aspect ratio that contains the widened box
+    size = model_shape * float((widened / model_shape).max())
+    size *= min(1.0, photo_width / size[0], photo_height / size[1])  # not larger
+    width, height = (max(1, math.floor(side)) for side in size)
+    return width, height
+
+
+def _is_out_of_view(
+    low: Float64Array, high: Float64Array, photo_size: tuple[int, int]
+) -> bool:
+    """Return whether a box lies outside of a photograph.
+
+    Args:
+        low, high: corners (x, y) of the box in pixels.
+        photo_size: (height, width) of the photograph in pixels.
+    """
+    photo_height, photo_width = photo_size
+    is_left_or_above = high[0] <= 0.0 or high[1] <= 0.0
+    is_right_or_below = low[0] >= photo_width or low[1] >= photo_height
+    return bool(is_left_or_above or is_right_or_below)
 
 
 def _center_within(center: float, length: int, limit: int) -> int:
@@ -245,24 +280,29 @@ class LayerRenderer:
         scene_inputs = renderer.scene.input_assembler(
             make_camera_inputs(item, self._asset, window)
         )
-        seed = seeds.derive_seed(self._seed, "layer", number)
         with torch.no_grad():
-            # with an alpha channel, since the environment is hidden
-            rendered = renderer.render_radiance(
-                scene_inputs, seed, self._spp, hide_environment=True
-            )
+            rendered = self._render_without_environment(scene_inputs, number)
             surfaces = renderer.scene.find_surfaces(scene_inputs)
             rendered = resize(rendered, (window.height, window.width))
             image_inputs = self._make_image_inputs(item, photograph, window)
             # Controls may change the finished image; none varies here.
             composed = renderer.finish_image(rendered, image_inputs, renderer.start)
-        return Layer(
-            composed=composed,
-            alpha=rendered[..., 3].clamp(0.0, 1.0),
-            visible_surface=_make_sight(
-                surfaces, self._asset.size_in_metres, model_size
-            ),
+        sight = _make_sight(surfaces, self._asset.size_in_metres, model_size)
+        alpha = rendered[..., 3].clamp(0.0, 1.0)
+        return Layer(composed=composed, alpha=alpha, visible_surface=sight)
+
+    def _render_without_environment(self, scene_inputs: Any, number: int) -> Tensor:
+        """Render the radiance of the object alone, with an alpha channel: (h, w, 4).
+
+        Args:
+            scene_inputs: inputs of the scene, with those of the camera.
+            number: number of the row, from which the seed of the noise is derived.
+        """
+        seed = seeds.derive_seed(self._seed, "layer", number)
+        radiance: Tensor = self._renderer.render_radiance(
+            scene_inputs, seed, self._spp, hide_environment=True
         )
+        return radiance
 
     def _make_image_inputs(
         self,
@@ -362,27 +402,20 @@ def make_twin(
         render_of_environment: sRGB renders (H, W, 3) of the object, by environment.
         model_size: (height, width) in pixels.
     """
-    window_size = (window.height, window.width)
     crop = cut_photograph(photograph, window)
     visible_coverage = _compute_visible_coverage(item, photograph, window, layer)
-    is_covered = visible_coverage >= 0.5
     around = crop[visible_coverage < 0.5]
-    # If the object fills the window, the mean of the window is the best guess.
-    mean_around = around.mean(dim=0) if len(around) else crop.mean(dim=(0, 1))
-    in_environments = {
-        name: resize(image, window_size)
-        for name, image in render_of_environment.items()
-    }
-    hole = torch.lerp(crop, mean_around.expand_as(crop), visible_coverage[..., None])
+    window_size = (window.height, window.width)
     images = {
         PHOTOGRAPH: crop,
         COMPOSED: layer.composed,
-        **in_environments,
-        HOLE: hole,
+        **_resize_all(render_of_environment, window_size),
+        HOLE: _replace_by_mean(crop, around, visible_coverage),
     }
+    is_covered = visible_coverage >= 0.5
     difference = (layer.composed - crop)[is_covered]
     return Twin(
-        images={name: resize(image, model_size) for name, image in images.items()},
+        images=_resize_all(images, model_size),
         visible_surface=layer.visible_surface,
         # The full silhouette, with hidden parts, is compared with the data's mask.
         coverage=layer.alpha,
@@ -394,6 +427,26 @@ def make_twin(
             layer.composed[is_covered], crop[is_covered]
         ),
     )
+
+
+def _resize_all(
+    images: Mapping[str, Tensor], size: tuple[int, int]
+) -> dict[str, Tensor]:
+    """Resize images (H, W, C) by name to (height, width)."""
+    return {name: resize(image, size) for name, image in images.items()}
+
+
+def _replace_by_mean(crop: Tensor, around: Tensor, visible_coverage: Tensor) -> Tensor:
+    """Return a photograph (h, w, 3) with the object replaced by the mean around it.
+
+    Args:
+        crop: the photograph.
+        around: (n, 3) the pixels around the object; there may be none.
+        visible_coverage: (h, w) how much of each pixel the object covers.
+    """
+    # If the object fills the window, the mean of the window is the best guess.
+    mean_around = around.mean(dim=0) if len(around) else crop.mean(dim=(0, 1))
+    return torch.lerp(crop, mean_around.expand_as(crop), visible_coverage[..., None])
 
 
 def _compute_visible_coverage(

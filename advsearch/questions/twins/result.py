@@ -363,9 +363,8 @@ def make_agreement_part(table: Sequence[results.TwinAgreement]) -> ResultPart:
         if total.model not in models_above:
             models_above.add(total.model)
             rows.append(_make_photograph_cells(total, f"{prefix}{PHOTOGRAPH}"))
-        rows.append(
-            _make_agreement_cells(total, f"{prefix}{_name_surroundings(total)}")
-        )
+        name = f"{prefix}{_name_surroundings(total)}"
+        rows.append(_make_agreement_cells(total, name))
     return ResultPart(
         "How far twins hold", column_heads=HEADS, rows=rows, note=TABLE_NOTE
     )
@@ -388,42 +387,56 @@ def _name_surroundings(row: results.TwinAgreement) -> str:
 def _make_group_parts(table: Sequence[results.TwinAgreement]) -> Iterator[ResultPart]:
     """Yield the tables by object and by condition."""
     surroundings = list(dict.fromkeys(row.surroundings for row in table))
-    several = len({row.model for row in table}) > 1
     for kind in ("object", "condition"):
         for name in surroundings:
-            rows = []
-            for row in table:
-                group = getattr(row, kind)
-                if group and row.surroundings == name:
-                    group = f"{row.model}: {group}" if several else group
-                    rows.append(_make_agreement_cells(row, group))
             title = f"By {kind}: {name}"
             heads = (kind, *HEADS[1:])
+            rows = _list_group_cells(table, kind, name)
             yield ResultPart(
                 title, column_heads=heads, rows=rows, folded=True, only_medium="page"
             )
 
 
+def _list_group_cells(
+    table: Sequence[results.TwinAgreement], kind: str, surroundings: str
+) -> list[list[str]]:
+    """Return the rows of the table by object or by condition, for some surroundings.
+
+    Args:
+        table: counts of all groups.
+        kind: "object" or "condition".
+        surroundings: name of the twins' surroundings.
+    """
+    several = len({row.model for row in table}) > 1
+    rows = []
+    for row in table:
+        group = getattr(row, kind)
+        if group and row.surroundings == surroundings:
+            group = f"{row.model}: {group}" if several else group
+            rows.append(_make_agreement_cells(row, group))
+    return rows
+
+
 def _make_factor_part(result: TwinsResult) -> ResultPart:
     """Return the table of how often twins disagree, by parts of each factor."""
-    rows = []
-    for part in result.factors:
-        bounds = f"{_format_factor(part.lower)} to {_format_factor(part.upper)}"
-        rows.append(
-            [
-                part.factor,
-                f"{bounds} {part.unit}".strip(),
-                f"{part.disagreeing} of {part.pairs}",
-                wording.format_estimate(part.rate),
-            ]
-        )
     return ResultPart(
         "What goes with disagreement",
         column_heads=("", "from", "disagree", "rate"),
-        rows=rows,
+        rows=[_make_factor_cells(part) for part in result.factors],
         note="Of twins in the photograph. Each factor is cut into parts with as many "
         "pairs; a part that stands out is a hint, and no cause.",
     )
+
+
+def _make_factor_cells(part: FactorPart) -> list[str]:
+    """Return the cells of a part of a factor: its range, and how many disagree."""
+    bounds = f"{_format_factor(part.lower)} to {_format_factor(part.upper)}"
+    return [
+        part.factor,
+        f"{bounds} {part.unit}".strip(),
+        f"{part.disagreeing} of {part.pairs}",
+        wording.format_estimate(part.rate),
+    ]
 
 
 def _format_factor(value: float) -> str:
@@ -476,23 +489,33 @@ def summarize_composed(composed: results.TwinAgreement) -> str:
         composed: counts of one model for objects rendered into the photographs.
     """
     agreement = wording.format_estimate(composed.agreement)
-    counts = (
-        f"{wording.format_count(composed.pairs, 'pair')} of "
-        f"{wording.format_count(composed.frames, 'frame')}"
+    counts = _format_counts(composed)
+    return (
+        f"Twins in the photograph agree with it in {agreement} of {counts}. "
+        f"{_describe_wrong_twins(composed)}"
     )
-    sentences = [f"Twins in the photograph agree with it in {agreement} of {counts}."]
+
+
+def _format_counts(row: results.TwinAgreement) -> str:
+    """Format how many pairs and frames a row counts: ``40 pairs of 12 frames``."""
+    return (
+        f"{wording.format_count(row.pairs, 'pair')} of "
+        f"{wording.format_count(row.frames, 'frame')}"
+    )
+
+
+def _describe_wrong_twins(composed: results.TwinAgreement) -> str:
+    """Describe how often photographs are wrong where their twins are."""
     if composed.wrong_where_twin_wrong is not None:
-        sentences.append(
+        return (
             f"Where a twin is wrong, the photograph is wrong in "
             f"{wording.format_estimate(composed.wrong_where_twin_wrong)}; at all, in "
             f"{wording.format_estimate(composed.photo_wrong)}."
         )
-    else:
-        sentences.append(
-            f"{composed.wrong_twins} of them are wrong, too few to state what a failing "
-            "twin says of its photograph."
-        )
-    return " ".join(sentences)
+    return (
+        f"{composed.wrong_twins} of them are wrong, too few to state what a failing "
+        "twin says of its photograph."
+    )
 
 
 def _make_pair_parts(result: TwinsResult) -> Iterator[ResultPart]:
@@ -511,13 +534,26 @@ def _make_pair_parts(result: TwinsResult) -> Iterator[ResultPart]:
             for image in row.predictions
         ]
         lines.append(f"{name}: {'; '.join(texts)}")
-        # The images of the last surroundings may not be stored.
-        captions = texts[: len(pair.pictures)]
-        if captions:
-            captions[0] = f"{name}, {row.size:.0f} pixels. {captions[0]}"
-        groups.append(list(map(views.Picture, pair.pictures, captions)))
+        groups.append(_list_pair_pictures(pair, name, texts))
     yield ResultPart(title, lines[:MAX_TEXT_PAIRS], only_medium="text")
     yield ResultPart(title, pictures=groups, only_medium="page")
+
+
+def _list_pair_pictures(
+    pair: TwinPair, name: str, texts: Sequence[str]
+) -> list[views.Picture]:
+    """Return the stored images of a pair with their captions.
+
+    Args:
+        pair: the pair.
+        name: name of the pair, with which the first caption begins.
+        texts: what is predicted about each image.
+    """
+    # The images of the last surroundings may not be stored.
+    captions = list(texts[: len(pair.pictures)])
+    if captions:
+        captions[0] = f"{name}, {pair.row.size:.0f} pixels. {captions[0]}"
+    return list(map(views.Picture, pair.pictures, captions))
 
 
 def _describe_prediction(image: TwinPrediction) -> str:
@@ -538,13 +574,9 @@ def make_twins_claims(result: TwinsResult) -> Iterator[views.Claim]:
             row.agreement.interval,
             row.agreement.value,
         )
-        counts = (
-            f"{wording.format_count(row.pairs, 'pair')} of "
-            f"{wording.format_count(row.frames, 'frame')}"
-        )
         statement = (
             f"{row.model}, {_name_surroundings(row)}: agrees with the photograph in "
-            f"{wording.format_estimate(row.agreement)} of {counts}; photographs wrong "
-            f"where it is wrong: {format_conditional(row)}."
+            f"{wording.format_estimate(row.agreement)} of {_format_counts(row)}; "
+            f"photographs wrong where it is wrong: {format_conditional(row)}."
         )
         yield views.Claim(kind="measured", statement=statement, extent=extent)
