@@ -504,10 +504,10 @@ class SceneConfig(Config):
                 _check_model_per_task(names, tasks)
             elif len(names) > 1 and setting_name not in self.list_settings:
                 raise make_single_value_error(setting_name, names)
-        self._check_size_of_one_object()
+        self._check_single_object_if_size_is_set()
         return self
 
-    def _check_size_of_one_object(self) -> None:
+    def _check_single_object_if_size_is_set(self) -> None:
         """Check that a size is not set for several objects.
 
         Raises:

@@ -583,7 +583,7 @@ def shorten_conditions(
     """
     full_score = scorer.score(conditions)
     while len(conditions) > 1:
-        shorter = max(_list_without_one(conditions), key=scorer.score)
+        shorter = max(_remove_each_condition(conditions), key=scorer.score)
         loss = full_score - scorer.score(shorter)
         tolerated_loss = (1.0 - RETAINED_ACCURACY) * full_score
         # A loss below its standard error may be chance.
@@ -594,7 +594,7 @@ def shorten_conditions(
     return conditions
 
 
-def _list_without_one(conditions: RuleConditions) -> list[RuleConditions]:
+def _remove_each_condition(conditions: RuleConditions) -> list[RuleConditions]:
     """Return, for each condition, all others."""
     return [
         conditions[:index] + conditions[index + 1 :] for index in range(len(conditions))
@@ -847,8 +847,8 @@ def grow_trees(
     forest = make_forest(
         N_TREES, **limits, max_features=0.6, random_state=random_state
     ).fit(data, is_right)
-    estimators = (single_tree, *forest.estimators_)
-    trees = [(estimator.tree_, columns) for estimator in estimators]
+    trees = [(single_tree.tree_, columns)]
+    trees += [(estimator.tree_, columns) for estimator in forest.estimators_]
     for index, column in enumerate(columns):
         # only a column that is measured from another zero has a `turn`
         if column.full_condition.turn > 0.0:

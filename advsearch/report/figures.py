@@ -694,8 +694,9 @@ def make_contact_sheet(
     n_columns = choose_column_count(len(pictures))
     n_rows = math.ceil(len(pictures) / n_columns)
     # one more gap is at the left and above
-    sheet_size = (GAP + n_columns * cell_width, GAP + n_rows * cell_height)
-    sheet = Image.new("RGB", sheet_size, "white")
+    sheet = Image.new(
+        "RGB", (GAP + n_columns * cell_width, GAP + n_rows * cell_height), "white"
+    )
     for index, picture in enumerate(pictures):
         row, column = divmod(index, n_columns)
         corner = (GAP + column * cell_width, GAP + row * cell_height)

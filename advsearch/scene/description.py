@@ -466,7 +466,7 @@ class SceneDescription(SceneData):
         # A requested elevation takes the place of the height: only one can be set.
         if "camera.elevation" not in self.requested:
             # The preset's height is above the floor, the setting above the ground.
-            floor = -TABLE_HEIGHT if is_on_table else self._find_place_floor()
+            floor = -TABLE_HEIGHT if is_on_table else self._find_floor_height()
             preset_values["camera.height"] = preset.height + floor
         if preset.in_lane:  # azimuth 0 is in the lane of the object
             preset_values["camera.azimuth"] = 0.0
@@ -474,10 +474,10 @@ class SceneDescription(SceneData):
             preset_values["ground.size"] = TABLE_SIDE / self.size_in_metres
         return preset_values
 
-    def _find_place_floor(self) -> float:
+    def _find_floor_height(self) -> float:
         """Return the height of the place's floor, meters; 0 without a place."""
-        place = find_place(self)
-        return 0.0 if place is None else place.file.floor
+        surroundings = find_place(self)
+        return 0.0 if surroundings is None else surroundings.file.floor
 
     def _is_on_table(self) -> bool:
         """Return whether the object is so small that its plain ground is a table."""

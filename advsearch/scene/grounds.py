@@ -156,7 +156,7 @@ def load_requested_place(scene: SceneData) -> Place | None:
     """
     kind = find_ground_kind(scene)
     if kind is not None:
-        return _load_place_of_kind(kind)
+        return _load_bundled_surroundings(kind)
     if scene.environment is None:
         return None
     has_table_settings = not scene.requested.isdisjoint(settings.TABLE_SETTINGS)
@@ -167,7 +167,7 @@ def load_requested_place(scene: SceneData) -> Place | None:
     return surroundings
 
 
-def _load_place_of_kind(kind: str) -> Place | None:
+def _load_bundled_surroundings(kind: str) -> Place | None:
     """Return the bundled place of a kind of ground; None for a kind that is no place."""
     if kind not in PLACE_BY_GROUND_KIND:
         return None
@@ -194,17 +194,21 @@ def with_requested_ground(scene: AnyScene) -> AnyScene:
         if len(other_parts) == len(scene.parts):
             return scene
         return replace(scene, parts=other_parts)
-    laid_parts = _make_parts_of(place, scene)
+    laid_parts = _make_surrounding_parts(place, scene)
     return replace(scene, parts=(*other_parts, *laid_parts))
 
 
-def _make_parts_of(place: Place, scene: SceneData) -> tuple[MeshPart, ...]:
+def _make_surrounding_parts(
+    surroundings: Place, scene: SceneData
+) -> tuple[MeshPart, ...]:
     """Return the parts of a place; its lamps are on if the environment is dark."""
     environment = scene.environment
     radiance_unit = None if environment is None else environment.candelas
     # Nothing but lamps depends on darkness.
-    is_dark = bool(place.file.lamps) and _is_dark(environment)
-    return make_place_parts(place, scene.size_in_metres, radiance_unit, is_dark=is_dark)
+    is_dark = bool(surroundings.file.lamps) and _is_dark(environment)
+    return make_place_parts(
+        surroundings, scene.size_in_metres, radiance_unit, is_dark=is_dark
+    )
 
 
 def _is_dark(environment: EnvironmentAsset | None) -> bool:

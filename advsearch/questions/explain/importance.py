@@ -166,12 +166,12 @@ class _Cells(NamedTuple):
     """What groups and clusters of predictions have in common.
 
     Attributes:
-        index: the cell of each prediction (n,).
+        cell_of_prediction: the cell of each prediction (n,).
         group: the group of each cell (cells,).
         cluster: the cluster of each cell (cells,).
     """
 
-    index: IntArray
+    cell_of_prediction: IntArray
     group: IntArray
     cluster: IntArray
 
@@ -364,7 +364,7 @@ class ClusteredPredictions:
         """
         is_used = group_weight > 0
         residual = self._weighted_residual(group, group_weight, is_used)
-        cell_residual = np.bincount(cells.index, residual)
+        cell_residual = np.bincount(cells.cell_of_prediction, residual)
         # (groups,) sum over the cells of each group
         squared_residual = np.bincount(
             cells.group, cell_residual**2, minlength=len(group_weight)

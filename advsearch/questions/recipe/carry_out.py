@@ -672,7 +672,8 @@ def _range_around(
     is_full_turn = parameter.periodic and upper - lower >= FULL_TURN
     if is_full_turn:  # an angle beyond the bounds is the same as one within them
         half_width = min(half_width, FULL_TURN / 2)
-        lower, upper = -math.inf, math.inf  # not clipped
+        lower = -math.inf  # not clipped
+        upper = math.inf
     bounds = [max(center - half_width, lower), min(center + half_width, upper)]
     if parameter.log:
         return [math.exp(bound) for bound in bounds]

@@ -584,10 +584,8 @@ def _measure_squared_angles(
         samples: samples of the BSDF.
         towards_viewer, up: (N_ANGLES,) components of the mean direction.
     """
-    one_minus_cosine = (
-        1.0 - samples.x * towards_viewer[:, None] - samples.z * up[:, None]
-    )
-    return np.asarray(2.0 * np.maximum(0.0, one_minus_cosine))
+    half_square = 1.0 - samples.x * towards_viewer[:, None] - samples.z * up[:, None]
+    return np.asarray(2.0 * np.maximum(0.0, half_square))
 
 
 def _measure_diffuse_fraction(samples: _BsdfSamples) -> Float64Array:

@@ -159,9 +159,8 @@ def hammer(sampler: ParameterSampler) -> Instance:
     drop = max(half_head * 1.05, half_face) - half_grip
     lay = shapes.make_rotation_matrix("y", _compute_hammer_tilt(drop, length))
     turn = shapes.make_rotation_matrix("z", sampler(58.0, low=20.0, high=90.0))
-    lying = shapes.transform_patches([*head, *handle], lay)
     return Instance(
-        shapes.transform_patches(lying, turn),
+        shapes.transform_patches(shapes.transform_patches([*head, *handle], lay), turn),
         _hammer_paints(sampler, front, length),
         sample_material(sampler, roughness=0.38, clearcoat=0.2),
     )
