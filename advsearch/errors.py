@@ -138,11 +138,19 @@ def _find_similar_spellings(name: str, known_names: Sequence[str]) -> list[str]:
 
 def _split_words(name: str) -> list[str]:
     """Return the words of a name in lower case; longer words without a plural s."""
-    words = [word for word in re.split(r"[\W_]+", name.casefold()) if word]
-    return [
-        re.sub("(?<=ss|sh|ch)es$|(?<=[^s])s$", "", word) if len(word) > 3 else word
-        for word in words
-    ]
+    words = re.split(r"[\W_]+", name.casefold())
+    return [_remove_plural_ending(word) for word in words if word]
+
+
+def _remove_plural_ending(word: str) -> str:
+    """Return a word without the "s" or "es" of a plural; of at most 3 letters, as it is."""
+    if len(word) <= 3:
+        return word
+    if word.endswith(("sses", "shes", "ches")):
+        return word[:-2]
+    if word.endswith("s") and not word.endswith("ss"):
+        return word[:-1]
+    return word
 
 
 def _rank(query: Sequence[str], words: Sequence[str]) -> tuple[int, int, bool] | None:

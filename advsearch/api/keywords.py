@@ -494,7 +494,7 @@ def make_config(config: type[ConfigType], **keywords: Any) -> ConfigType:
     Raises:
         InputError: a setting is wrong, or contradicts an object.
     """
-    settings = {name: value for name, value in keywords.items() if value is not None}
+    settings = drop_unset(keywords)
     _check_no_workers_for_objects(settings)
     replaced = _ReplacedObjects()
     replaced.replace_model(settings)
@@ -586,9 +586,7 @@ def _replace_scene_object(settings: dict[str, Any], scene: loading.Scene) -> Non
     )
     # the settings with which it was loaded, with the name of its object
     scene_settings = loading.scene_to_settings(scene)
-    settings |= {
-        name: value for name, value in scene_settings.items() if value is not None
-    }
+    settings |= drop_unset(scene_settings)
 
 
 def _list_session_only_parts(instances: Sequence[Any]) -> list[PythonOnly]:

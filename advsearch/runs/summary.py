@@ -16,8 +16,8 @@ import platform
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
+from heapq import nsmallest
 from importlib import metadata
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -460,10 +460,9 @@ def _digest_folder(folder: Path, pattern: str) -> str:
     Args:
         folder: the folder.
         pattern: pattern of the paths of its files that count, such as "*/*". Only the
-            first `MAX_FILES` count; of more files, the order of the file system decides
-            which.
+            first `MAX_FILES` by name count.
     """
-    paths = sorted(islice(folder.glob(pattern), MAX_FILES))
+    paths = nsmallest(MAX_FILES, folder.glob(pattern))
     # Joined without separator: all digests have the same length.
     lines = [
         f"{path.relative_to(folder).as_posix()}\n{_digest_file(path)}"

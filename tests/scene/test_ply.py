@@ -157,6 +157,14 @@ def test_damage_is_refused(tmp_path: Path, old: bytes, new: bytes) -> None:
         read_parts(tmp_path / "a.ply", (tmp_path / "a.ply").read_bytes())
 
 
+def test_a_format_below_the_elements_is_refused(tmp_path: Path) -> None:
+    """Properties above it would have the byte order of this machine, whatever it says."""
+    line = b"format binary_big_endian 1.0\n"
+    data = square().written("binary_big_endian").replace(line, b"").replace(b"end_header", line + b"end_header")
+    with pytest.raises(FileFormatError, match="format binary_big_endian"):
+        read_parts(tmp_path / "a.ply", data)
+
+
 VERTEX = {
     **dict.fromkeys(("float confidence", "double quality", "float intensity", "uchar flags", "int radius"), True),
     **dict.fromkeys(

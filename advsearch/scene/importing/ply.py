@@ -185,7 +185,8 @@ class _Header:
     def add_line(self, line: str) -> bool:
         """Store what a line states, and return whether it is understood."""
         match line.split():
-            case ["format", kind, *_] if kind in _FORMATS:
+            # It has the byte order of all properties, so it stands above the elements.
+            case ["format", kind, *_] if kind in _FORMATS and not self.elements:
                 self.byte_order = _FORMATS[kind]
             case ["comment" | "obj_info" as keyword, *_]:
                 self.comments.append(line.strip().removeprefix(keyword).strip())
@@ -232,7 +233,7 @@ def _make_dtype(kind: str, byte_order: str | None) -> np.dtype[np.generic]:
     """Return the type of numbers of a kind, such as "float".
 
     The byte order is that of the machine if `byte_order` is "" (of an ASCII file) or
-    None (the `format` line has not come yet).
+    None (there is no `format` line, so that the file is refused).
     """
     return np.dtype((byte_order or "") + _TYPES[kind])
 
