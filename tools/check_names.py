@@ -9,6 +9,7 @@
 - `a, b = x, y`, which puts two thoughts on one line;
 - a conditional expression inside another;
 - functions with 15 local variables or more;
+- functions whose body has more than 25 lines of code;
 - descriptions of arguments and attributes that begin with "of": `seed: of the noise`
   has to be read twice, `seed: seed of the noise` once;
 - functions of ten lines or more without a docstring are counted, not refused.
@@ -23,8 +24,10 @@ from __future__ import annotations
 
 import argparse
 import ast
+import io
 import re
 import sys
+import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -41,6 +44,8 @@ ALLOWED = frozenset[str]()
 for.
 """
 MAX_LOCALS = 14
+MAX_BODY_LINES = 25
+"""Readers understand functions of up to 13 lines at once, and a third of those above 25."""
 FRAGMENT = re.compile(r" +`*\**(\w+(?:, \**\w+)*)`*(?: \([^)]*\))?: of ")
 WORDS = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|_")
 Function = ast.FunctionDef | ast.AsyncFunctionDef
@@ -147,6 +152,43 @@ def check_tree(node: ast.AST, path: str, scope: str = "") -> Iterator[Finding]:
         yield from check_tree(child, path, inner)
 
 
+def find_code_lines(source: str) -> set[int]:
+    """Return the numbers of lines that have more than blanks and comments."""
+    no_code = (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT)
+    lines = set[int]()
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type not in no_code:
+            lines.update(range(token.start[0], token.end[0] + 1))
+    return lines
+
+
+def check_lengths(tree: ast.AST, source: str, path: str) -> Iterator[Finding]:
+    """Yield the functions that are too long, without signatures and docstrings."""
+    code_lines = find_code_lines(source)
+    for scope, function in iterate_functions(tree):
+        body = function.body
+        if ast.get_docstring(function, clean=False) is not None:
+            body = body[1:]
+        if not body:
+            continue
+        end = function.end_lineno or function.lineno
+        n_lines = len(code_lines.intersection(range(body[0].lineno, end + 1)))
+        if n_lines > MAX_BODY_LINES:
+            text = f"{n_lines} lines of code; split it into steps that have names"
+            yield Finding(path, function.lineno, scope, "length", text)
+
+
+def iterate_functions(node: ast.AST, scope: str = "") -> Iterator[tuple[str, Function]]:
+    """Yield the functions in a syntax tree, with their names as in `check_tree`."""
+    for child in ast.iter_child_nodes(node):
+        inner = scope
+        if isinstance(child, Function | ast.ClassDef):
+            inner = f"{scope}.{child.name}".lstrip(".")
+        if isinstance(child, Function):
+            yield inner, child
+        yield from iterate_functions(child, inner)
+
+
 def find_all(package: Path) -> list[Finding]:
     """Return the findings of all files of a package, in the order of files and
     lines.
@@ -154,8 +196,10 @@ def find_all(package: Path) -> list[Finding]:
     findings: list[Finding] = []
     for path in sorted(package.rglob("*.py")):
         relative = path.relative_to(package.parent).as_posix()
-        tree = ast.parse(path.read_text("utf-8"), str(path))
+        source = path.read_text("utf-8")
+        tree = ast.parse(source, str(path))
         findings += check_tree(tree, relative)
+        findings += check_lengths(tree, source, relative)
     return sorted(findings, key=lambda finding: (finding.path, finding.line))
 
 
