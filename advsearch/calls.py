@@ -238,3 +238,8 @@ def with_checked_arguments(function: Function) -> Function:
         return function(*args, **keywords)
 
     return wrapper  # type: ignore[return-value]
+
+
+def drop_unset(keywords: Mapping[str, object]) -> dict[str, Any]:
+    """Return the settings that a caller passed as keywords; None counts as not passed."""
+    return {name: value for name, value in keywords.items() if value is not None}

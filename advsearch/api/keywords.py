@@ -22,7 +22,7 @@ from typing import Any, Literal, TypedDict, TypeVar
 import numpy as np
 from torch import nn
 
-from advsearch.calls import check_types, make_unexpected_error
+from advsearch.calls import check_types, drop_unset, make_unexpected_error
 from advsearch.config import LIST_SETTINGS
 from advsearch.engine import loading
 from advsearch.engine.naming import (
@@ -620,8 +620,3 @@ def _replace_control_objects(settings: dict[str, Any], name: str) -> Sequence[An
         check_no_worker_settings(settings)
     settings[name] = loading.controls_to_settings(controls)
     return instances
-
-
-def drop_unset(keywords: Mapping[str, object]) -> dict[str, Any]:
-    """Return the settings that a caller passed as keywords; None counts as not passed."""
-    return {name: value for name, value in keywords.items() if value is not None}

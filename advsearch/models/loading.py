@@ -13,6 +13,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from advsearch.calls import drop_unset
 from advsearch.catalog import list_built_ins
 from advsearch.errors import (
     InputError,
@@ -133,14 +134,16 @@ def load_model(
     Warns:
         ModelWarning: see `advsearch.models.probe.probe_model`.
     """
-    options = _drop_unset(
-        input_size=input_size,
-        mean=mean,
-        std=std,
-        value_range=value_range,
-        layout=layout,
-        channels=channels,
-        max_batch=max_batch,
+    options = drop_unset(
+        {
+            "input_size": input_size,
+            "mean": mean,
+            "std": std,
+            "value_range": value_range,
+            "layout": layout,
+            "channels": channels,
+            "max_batch": max_batch,
+        }
     )
     # A function that the caller gives takes precedence over that of the task. None
     # means that the output is logits.
@@ -217,11 +220,6 @@ def _state_purpose(
         times=getattr(task, "times", 1),
         ask=ask or {},
     )
-
-
-def _drop_unset(**options: Any) -> dict[str, Any]:
-    """Return the options that are not None."""
-    return {name: value for name, value in options.items() if value is not None}
 
 
 def _add_training_arguments(source: Source) -> Source:

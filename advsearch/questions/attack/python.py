@@ -14,11 +14,11 @@ from advsearch import losses
 from advsearch.api.keywords import (
     Names,
     SceneKeywords,
-    drop_unset,
     with_settings_signature,
 )
 from advsearch.attacks import Policy, make_policy
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
+from advsearch.calls import drop_unset
 from advsearch.config import SceneConfig
 from advsearch.engine import judging, loading, naming
 from advsearch.engine.judging import Metric

@@ -12,9 +12,9 @@ import torch
 
 from advsearch.api.keywords import (
     SceneKeywords,
-    drop_unset,
     with_settings_signature,
 )
+from advsearch.calls import drop_unset
 from advsearch.cluster import BatchFunction
 from advsearch.controls import Control
 from advsearch.controls.camera import CameraControl, adapt_length_unit
