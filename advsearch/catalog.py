@@ -19,8 +19,8 @@ class BuiltIn(NamedTuple):
 
     Attributes:
         kind: "experiment", "control", "policy", "task", "model source", "recognizer" of
-            networks from Python, "exporter", "reader" of mesh files, or "converter" of
-            files to glTF.
+            networks from Python, "exporter", "reader" of mesh files, "converter" of
+            files to glTF, or "predictor" of images.
         name: its name on the command line. For a reader or converter it is the suffix
             of its files, and for a recognizer the library of its networks.
         import_path: "module:attribute" that is imported when the part is used.
@@ -37,6 +37,8 @@ _EXPERIMENTS = "advsearch.questions"
 _CONTROLS = "advsearch.controls"
 _POLICIES = "advsearch.attacks.policies"
 _TASKS = "advsearch.tasks"
+_ENGINE = "advsearch.engine"
+_PREDICTORS = "advsearch.predictors"
 _MODELS = "advsearch.models"
 _EXPORTERS = "advsearch.cli.exporters"
 _READERS = "advsearch.scene.importing"
@@ -411,6 +413,25 @@ BUILT_INS = (
         f"{_TASKS}.rig:Rig",
         "several cameras take pictures of one configuration, and the model's predictions "
         "of them are combined into one",
+    ),
+    # from the cheapest to the most expensive: they are tried in this order
+    BuiltIn(
+        "predictor",
+        "matrix",
+        f"{_ENGINE}.transport:MatrixMethod",
+        "a matrix of light transport, or a picture of each light",
+    ),
+    BuiltIn(
+        "predictor",
+        "surface_light",
+        f"{_PREDICTORS}.surface_light:SurfaceLightMethod",
+        "light stored on surfaces, for searches and sweeps over cameras",
+    ),
+    BuiltIn(
+        "predictor",
+        "bank",
+        f"{_PREDICTORS}.bank:BankMethod",
+        "matrices of some conditions, for searches whose conditions vary",
     ),
     BuiltIn(
         "model source",

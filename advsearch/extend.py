@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from advsearch import statistics as statistics
     from advsearch import tasks as tasks
     from advsearch.api import exports as exports
+    from advsearch.api import prediction as prediction
     from advsearch.api import workbench as workbench
     from advsearch.attacks import Policy as Policy
     from advsearch.attacks import policies as policies
@@ -54,8 +55,6 @@ if TYPE_CHECKING:
     from advsearch.report import figures as figures
     from advsearch.report import views as views
     from advsearch.report import wording as wording
-    from advsearch.report.views import ResultPart as ResultPart
-    from advsearch.report.views import ShownResult as ShownResult
     from advsearch.runs import directory as directory
     from advsearch.runs import results as results
     from advsearch.runs.directory import RunDirectory as RunDirectory
@@ -93,7 +92,6 @@ _NAMES = {
     "advsearch.progress": ("Progress",),
     "advsearch.questions.attack.settings": ("AttackConfig",),
     "advsearch.questions.sweep.settings": ("SweepConfig",),
-    "advsearch.report.views": ("ResultPart", "ShownResult"),
     "advsearch.runs.directory": ("RunDirectory",),
     "advsearch.runs.exporters": ("Exported", "Exporter"),
     "advsearch.runs.results": ("RunResult",),
@@ -120,6 +118,7 @@ _MODULES = {
     "models": "advsearch.models",
     "parts": "advsearch.scene.parts",
     "policies": "advsearch.attacks.policies",
+    "prediction": "advsearch.api.prediction",
     "reading": "advsearch.scene.importing.reading",
     "results": "advsearch.runs.results",
     "rules": "advsearch.rules",

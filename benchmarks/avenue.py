@@ -50,9 +50,9 @@ from advsearch.attacks import Policy, SearchResult
 from advsearch.engine import windows
 from advsearch.engine.crop import CroppedSearch
 from advsearch.engine.journal import Journal, ParallelEvaluator
+from advsearch.engine.prediction import CleanMatrix
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import RunState
-from advsearch.engine.transport import CleanMatrix
 from advsearch.progress import NullProgress, Stages
 from advsearch.questions.attack import stages
 from advsearch.questions.attack.carry_out import load_parts, make_problem

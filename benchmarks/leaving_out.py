@@ -56,13 +56,13 @@ from advsearch.engine.loading import (
 from advsearch.engine.problem import Problem
 from advsearch.engine.windows import MIN_STEPS, find_window
 from advsearch.errors import InputError
+from advsearch.predictors.surface_light.renderer import SurfaceRenderer
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.scene.formation import ALL_OMISSIONS, NO_OMISSIONS
 from advsearch.scene.predictor import Refusal
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import FAMILIES, MATERIAL, SETTINGS
-from advsearch.scene.surface.renderer import SurfaceRenderer
 
 PAIRS = (
     ("mug", "studio", "texture"),

@@ -70,6 +70,7 @@ from advsearch.engine.acceptance import (
 )
 from advsearch.engine.loading import load_scene
 from advsearch.models import Model, load_model
+from advsearch.predictors.surface_light.renderer import SurfaceRenderer, find_refusal
 from advsearch.progress import NullProgress
 from advsearch.questions.attack.run import attack_once
 from advsearch.questions.attack.settings import AttackConfig
@@ -80,7 +81,6 @@ from advsearch.questions.sweep.loop import Sweep
 from advsearch.questions.sweep.result import SweepResult
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.surface.renderer import SurfaceRenderer, find_refusal
 
 SCENES = ("mug@studio", "bottle@studio", "bowl@kitchen")
 SPP = 8

@@ -87,6 +87,7 @@ RULES = {
     "viewer": Rule({"runs", "report", "config", "settings", "questions"}, {"numpy", "pandas", "PIL"}, HEAVY),
     "rules": Rule({"statistics", "runs"}, {"numpy", "pandas"}, HEAVY),
     "losses": Rule({"attacks", "engine"}, {"torch"}),
+    "predictors": Rule({"extend"}, {"torch", "numpy", "scipy"}, frozenset(RENDERER)),
     "maite": Rule({"scene", "models", "tasks", "engine"}, {"torch"}),
     "experiment": Rule({"runs", "report", "viewer", "api", "settings"}, {"pydantic"}, HEAVY),
     "questions": Rule(None, None, frozenset(RENDERER)),
@@ -248,7 +249,9 @@ def test_a_result_is_read_and_shown_without_what_renders() -> None:
 
 
 def test_only_the_backend_speaks_mitsuba() -> None:
-    """And the probe of `advsearch doctor`; a mesh's names stand once."""
+    """And the probe of `advsearch doctor`; predictors that trace rays get it with their interface. A mesh's names
+    stand once.
+    """
     backend = "advsearch.scene.mitsuba_backend"
     variant = f"{backend}.variant"
     users: dict[str, set[str]] = {}
@@ -258,7 +261,7 @@ def test_only_the_backend_speaks_mitsuba() -> None:
                 if name == variant or name.split(".")[0] in RENDERER:
                     users.setdefault(name, set()).add(module)
     probe = "advsearch.cli.doctor_probe"
-    assert users == {"drjit": {probe}, "mitsuba_oidn": {probe}, variant: {probe}}
+    assert users == {"drjit": {probe}, "mitsuba_oidn": {probe}, variant: {probe, "advsearch.api.prediction"}}
     for name, only in (("vertex_positions", f"{backend}.meshes"), ("llvm_ad_rgb", variant)):
         assert [module for module, path in python_files() if name in path.read_text(encoding="utf-8")] == [only]
 

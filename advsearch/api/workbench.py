@@ -103,9 +103,6 @@ from advsearch.questions.sweep.carry_out import (
 )
 from advsearch.questions.sweep.carry_out import row_parameters as row_parameters
 from advsearch.questions.sweep.display import surface_sentences as surface_sentences
-from advsearch.questions.sweep.predicting import (
-    prepare_surface_light as prepare_surface_light,
-)
 from advsearch.questions.sweep.stored import StoredSweep as StoredSweep
 from advsearch.questions.sweep.summary import SweepSummary as SweepSummary
 from advsearch.registry import get_experiment as get_experiment

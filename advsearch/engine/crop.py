@@ -15,7 +15,8 @@ from typing import ClassVar
 from advsearch import seeds
 from advsearch.attacks import Evaluation
 from advsearch.attacks.evaluation import Query
-from advsearch.engine.transport import COMPARISON_INTERVAL, PredictedSearch
+from advsearch.engine.prediction import PredictedSearch
+from advsearch.engine.transport import COMPARISON_INTERVAL
 from advsearch.engine.windows import (
     N_WINDOW_IMAGES,
     PROBE_SPP,

@@ -18,7 +18,7 @@ from advsearch.attacks import (
     count_right,
 )
 from advsearch.attacks.candidates import Bracket
-from advsearch.engine.transport import PredictedSearch
+from advsearch.engine.prediction import PredictedSearch
 from advsearch.options import NOT_A_NUMBER, Value, count_outcomes
 from advsearch.report.wording import format_count
 from advsearch.runs.results import ControlGroup, LinearTransport, VerifiedRate
@@ -62,7 +62,7 @@ class RunState:
         interrupted: whether the run was interrupted.
         predictor: predictor of the images of the searches; None if they were rendered.
         predictor_refusal: why images were not predicted, or only cropped.
-        surface_light_refusal: why images were predicted by matrices and not by light on
+        inaccuracy_refusal: why the first predictor that was tried was too inaccurate
             surfaces, if that was tried.
         crop_refusal: why full images were rendered.
         verification_renders: number of renders for trials, and for choosing their
@@ -89,7 +89,7 @@ class RunState:
     interrupted: bool = False
     predictor: PredictedSearch | None = None
     predictor_refusal: Refusal | None = None
-    surface_light_refusal: Refusal | None = None
+    inaccuracy_refusal: Refusal | None = None
     crop_refusal: Refusal | None = None
     verification_renders: int = 0
     n_predicted_trials: int = 0
@@ -113,7 +113,7 @@ class RunState:
         summary = self.predictor.summarize()
         # Why a better method was not used. Matrices are better than a crop, and light
         # on surfaces is better than matrices.
-        better_method_refusal = self.predictor_refusal or self.surface_light_refusal
+        better_method_refusal = self.predictor_refusal or self.inaccuracy_refusal
         # If the predictor was given up, its summary has that as the reason, which
         # stays.
         # a reason is there if predictions were given up

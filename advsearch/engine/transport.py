@@ -10,41 +10,55 @@ from __future__ import annotations
 
 import math
 import statistics
-import time
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks import Evaluate, Evaluation
+from advsearch.attacks import Evaluate, Evaluation, Policy
 from advsearch.attacks.evaluation import Query
-from advsearch.engine.acceptance import ComparedView, Deviation, compare_views
+from advsearch.engine.acceptance import Deviation
+from advsearch.engine.image_groups import Groups, MakeGroups
+from advsearch.engine.prediction import (
+    MIN_SAVING_FACTOR,
+    CleanMatrix,
+    PredictedSearch,
+    PredictionMethod,
+    SweepMethod,
+    count_check_samples,
+    find_general_refusal,
+)
 from advsearch.engine.problem import Problem
 from advsearch.engine.windows import (
     N_WINDOW_IMAGES,
     FullImage,
     Windowing,
     find_window,
-    measure_outside,
-    render_full,
 )
-from advsearch.runs.results import BankOfConditions, LinearTransport, PredictionError
 from advsearch.scene.color import round_to_8_bit
-from advsearch.scene.predictor import Predictor, Refusal, RefusalCause
+from advsearch.scene.predictor import (
+    MAX_BYTES,
+    NOISE,
+    NOTHING_MOVES,
+    Predictor,
+    Refusal,
+    RefusalCause,
+)
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.lights import (
+    BasisRenderer,
+    LightBasis,
     count_lights,
     count_samples,
+    find_light_groups,
     find_refusal,
     make_predictor,
 )
-from advsearch.scene.transport.matrix import ProgressCallback
-from advsearch.scene.window import Window
+from advsearch.scene.transport.matrix import COLLECTED_SPP, ProgressCallback
+from advsearch.trust.stored_files import scale_limit
 
 MIN_STEPS = 16
 """Smallest number of evaluations of a search for which the matrix pays. It costs as
@@ -59,6 +73,7 @@ MIN_SCORES = 4  # smallest number of trials to estimate a standard deviation
 # 19 of 20 normally distributed scores lie above the mean minus this many standard
 # deviations.
 LOWER_END_DEVIATIONS = 1.64
+BASIS_PIXEL_BYTES = 8  # approximate memory of a pixel of a basis image
 ADVICE = {
     RefusalCause.HAZE: "leave the haze out",
     RefusalCause.NOISE: "`denoise=oidn` takes the noise out",
@@ -80,11 +95,9 @@ def find_matrix_refusal(
         specialise: whether the search may leave out or predict anything at all (the
             setting of this name).
     """
-    if not specialise:
-        return Refusal("nothing is left out")  # which the user has set
-    # why the image is composed of several; "" if it is not
-    if problem.renderer.composition_reason:
-        return Refusal(problem.renderer.composition_reason)
+    refusal = find_general_refusal(problem, specialise)
+    if refusal is not None:
+        return refusal
     if steps is not None and steps < MIN_STEPS:
         return Refusal(
             f"a matrix pays from {MIN_STEPS} evaluations on", RefusalCause.TOO_FEW_STEPS
@@ -131,223 +144,6 @@ def make_rendering_remark(refusal: Refusal | None) -> str:
         "as predicting it"
     )
     return f"{costs}: {refusal}; {advice}."
-
-
-@dataclass
-class PredictedSearch(ABC):
-    """A predictor of the images of a run's searches.
-
-    All of it follows from the seed, so that a resumed run computes the same again.
-
-    Attributes:
-        method: name of the method, for reports.
-        title: text about its preparation, for the progress bar.
-        what_it_renders: text about what the search still renders, for the progress bar.
-        is_exact: whether equal configurations have equal objectives.
-        problem: problem of the searches.
-        steps: number of evaluations of a search. Later ones belong to the ranking, and
-            are traced.
-        draws_conditions: whether each evaluation draws conditions; see
-            `Domain.draws_conditions`.
-        deviations: deviation of predictions from traced images, for each comparison.
-        n_traced: number of images that were traced, for the predictor and for
-            comparisons.
-        seconds: time that was spent on both.
-        n_renewals: how often the predictor was computed again; None for a predictor
-            that never is.
-        first_traced: by kind of search, index of the first evaluation that is traced
-            because predictions were given up.
-        tracing_reason: why predictions were given up, as a sentence; None if they were
-            not.
-        window: the window of the image that is traced; None for the full image.
-    """
-
-    method: ClassVar[str] = "matrix"
-    title: ClassVar[str] = "collecting light transport"
-    what_it_renders: ClassVar[str] = "renders nothing"
-    is_exact: ClassVar[bool] = False
-
-    problem: Problem
-    steps: int
-    draws_conditions: bool = field(default=False, kw_only=True)
-    deviations: list[Deviation] = field(default_factory=list, kw_only=True)
-    n_traced: int = field(default=0, kw_only=True)
-    seconds: float = field(default=0.0, kw_only=True)
-    n_renewals: int | None = field(default=0, kw_only=True)
-    first_traced: dict[str, int] = field(default_factory=dict, kw_only=True)
-    tracing_reason: str | None = field(default=None, kw_only=True)
-    window: Window | None = field(default=None, kw_only=True)
-
-    @property
-    @abstractmethod
-    def preparation_spp(self) -> int:
-        """Samples per pixel that are traced before the search can begin."""
-
-    @abstractmethod
-    def prepare(self, tick: ProgressCallback = lambda samples: None) -> None:
-        """Compute the predictor at the start of the search.
-
-        `tick` is called with samples per pixel as they are traced.
-        """
-
-    @property
-    def accuracy_refusal(self) -> Refusal | None:
-        """Why it is too inaccurate to be used; None if it is not.
-
-        This was measured with images that were traced to prepare it.
-        """
-        return None
-
-    @abstractmethod
-    def replay(self, query: Query) -> None:
-        """Replay a query that was read from the store.
-
-        Comparisons and renewals happen as they did when it was evaluated.
-        """
-
-    @abstractmethod
-    def evaluate(self, query: Query) -> Evaluation:
-        """Evaluate one query of the search itself."""
-
-    def evaluate_all(
-        self, queries: Sequence[Query], trace: Evaluate
-    ) -> Iterator[Evaluation]:
-        """Evaluate queries of a search lazily.
-
-        Args:
-            queries: the queries.
-            trace: evaluates queries by rendered images. A subclass may use it for those
-                that it can't predict; here `evaluate` renders their images itself.
-        """
-        return map(self.evaluate, queries)
-
-    def get_window_renderer(self, kind: str) -> Renderer | None:
-        """Return the renderer of the window at the end of a kind of search.
-
-        None if full images are rendered.
-        """
-        return None
-
-    def rank_all(
-        self, queries: Sequence[Query], trace: Evaluate
-    ) -> Iterator[Evaluation]:
-        """Evaluate the queries of a ranking lazily.
-
-        A ranking renders the best configurations of a search again, to choose the best
-        one. So images are traced and not predicted; if there is a window, only the
-        window is traced.
-
-        Args:
-            queries: the queries, all of one kind.
-            trace: renders full images.
-        """
-        renderer = self.get_window_renderer(queries[0].kind)
-        if renderer is None:
-            yield from trace(queries)
-            return
-        for query in queries:
-            evaluation, _ = self.problem.evaluate_full(
-                query, query.u, query.seed, renderer
-            )
-            yield evaluation
-
-    @abstractmethod
-    def count_entries_and_bytes(self) -> tuple[int, int]:
-        """Return the number of entries of the matrices, for one color channel, and
-        their size in bytes.
-        """
-
-    def summarize_conditions(self) -> BankOfConditions | None:
-        """Return the state of a bank of conditions; None without conditions."""
-        return None
-
-    def count_predicted(self, kind: str, evaluations: int) -> int:
-        """Return how many of the first evaluations of a search were predicted."""
-        return min(evaluations, self.first_traced.get(kind, evaluations))
-
-    def compare(self, compare_view: Callable[[int], ComparedView]) -> Deviation:
-        """Compare predictions with traced images, and store the deviation.
-
-        `compare_view` compares a single view; see `acceptance.compare_views`.
-        """
-        with self.measure_seconds():
-            self.deviations.append(compare_views(compare_view))
-        self.n_traced += self.deviations[-1].n_traced
-        return self.deviations[-1]
-
-    def measure_surroundings(
-        self, window: Window, before: FullImage, u: Tensor
-    ) -> tuple[FullImage, Deviation]:
-        """Render the full image, and measure how it differs outside of the window.
-
-        Args:
-            window: the pixels that are predicted, which do not count.
-            before: an earlier full image, whose surroundings are in use.
-            u: (d,) the configuration to render.
-
-        Returns:
-            The full image of u, and the deviation of the earlier one from it.
-        """
-        current = render_full(self.problem, u)
-        self.n_traced += 1
-        return current, measure_outside(self.problem, window, before, [current])
-
-    def stop_predicting(self, kind: str, number: int, where: str = "") -> None:
-        """Give predictions up for a kind of search, and trace its images from now on.
-
-        Args:
-            kind: kind of the search.
-            number: index of the first evaluation that is traced.
-            where: text that follows "evaluation 20" in the reason for the user, such as
-                " of the search". If there is a reason already, it stays.
-        """
-        self.first_traced[kind] = number
-        reason = (
-            f"pictures are rendered from evaluation {number}{where} on: predicted "
-            "ones were too far off"
-        )
-        self.tracing_reason = self.tracing_reason or reason
-
-    @contextmanager
-    def measure_seconds(self) -> Iterator[None]:
-        """Count the time of a block as spent on the predictor."""
-        started = time.perf_counter()
-        yield
-        self.seconds += time.perf_counter() - started
-
-    def summarize(self) -> LinearTransport:
-        """Return the summary of the predictor, of any method, that a result stores.
-
-        A predictor was used even if predictions were given up later; `reason` then says
-        why.
-        """
-        entries, n_bytes = self.count_entries_and_bytes()
-        error = None
-        if self.deviations:
-            latest_deviation = self.deviations[-1]
-            error = PredictionError.from_values(latest_deviation)
-        return LinearTransport(
-            used=True,
-            method=self.method,
-            reason=self.tracing_reason,
-            window=self.window,
-            conditions=self.summarize_conditions(),
-            entries=entries,
-            bytes=n_bytes,
-            seconds=self.seconds,
-            renewed=self.n_renewals,
-            error=error,
-        )
-
-
-@dataclass
-class CleanMatrix:
-    """The matrices of the clean configuration, by the window that was traced.
-
-    Attacks that differ only in their budget of change share them.
-    """
-
-    predictors: dict[Window | None, Predictor] = field(default_factory=dict)
 
 
 @dataclass
@@ -599,3 +395,108 @@ class Transport(PredictedSearch):
         with torch.no_grad():
             image = round_to_8_bit(self.clean_predictor(u))
             return self.problem.judge(image, u).score
+
+
+class BasisPictures(SweepMethod):
+    """Predicts images at one size of a scene by a basis image of each light.
+
+    Images of a group differ only in the strength of lights: they are weighted sums of
+    the basis images.
+    """
+
+    name = "basis pictures"
+    samples = COLLECTED_SPP
+
+    def __init__(self, renderer: Renderer) -> None:
+        """Find the lights whose strength is a parameter."""
+        self._renderer = renderer
+        self._lighting = find_light_groups(renderer)
+        self.parameters = frozenset(self._lighting.inputs_by_group)
+        self.changes_scene = any(self._lighting.inputs_by_group.values())
+
+    def find_refusal(self, make_groups: MakeGroups, spp: int) -> Refusal | None:
+        """Return why images are rendered; None if they are predicted.
+
+        Images are predicted if that takes at most 1 / `MIN_SAVING_FACTOR` of the
+        samples that rendering a group takes, and if the basis images fit into memory.
+
+        Args:
+            make_groups: returns the groups whose images differ in some parameters.
+            spp: samples per pixel of the images.
+        """
+        groups = make_groups(self.parameters)
+        # Only an image without noise can be predicted from basis images.
+        is_denoised = self._renderer.formation.denoiser == "oidn"
+        if not is_denoised:
+            return NOISE
+        n_lights = self._count_lights()
+        prediction_samples = n_lights * COLLECTED_SPP + count_check_samples(spp)
+        # Rendering a group takes `spp` for each image.
+        min_images = math.ceil(MIN_SAVING_FACTOR * prediction_samples / spp)
+        if groups.group_size < min_images:
+            return Refusal(
+                f"basis pictures pay where {min_images} pictures or more differ in "
+                f"light alone; here {groups.group_size} do"
+            )
+        return self._find_memory_refusal(groups, n_lights)
+
+    def _count_lights(self) -> int:
+        """Count the lights, whose number is the same in all configurations."""
+        renderer = self._renderer
+        start_inputs = renderer.space.inputs(renderer.start)
+        inputs = renderer.scene.input_assembler(start_inputs)
+        return len(LightBasis(renderer, self._lighting, inputs).inputs_of_light)
+
+    def _find_memory_refusal(self, groups: Groups, n_lights: int) -> Refusal | None:
+        """Return a refusal if the basis images take too much memory; else None."""
+        height, width = self._renderer.formation.resolution
+        bytes_per_basis_image = BASIS_PIXEL_BYTES * height * width
+        n_bytes = groups.n_groups_to_cache * n_lights * bytes_per_basis_image
+        if n_bytes > scale_limit(MAX_BYTES):
+            return Refusal(
+                f"basis pictures of {groups.n_groups} groups take too much memory; "
+                "make "
+                "light the last axes of the grid"
+            )
+        return None
+
+    def make_predictor(self, u: Tensor, seed: int) -> Predictor:
+        """Return the predictor of the images of a group.
+
+        Args:
+            u: (d,) configuration of any image of the group: they differ only in light,
+                which the predictor takes from the image to predict.
+            seed: seed of the light paths of its basis images.
+        """
+        return BasisRenderer(self._renderer, u, seed, changing=self._lighting)
+
+
+class MatrixMethod(PredictionMethod):
+    """Predicts by a matrix of light transport, or by basis images if lights change.
+
+    A single matrix is for searches without random conditions, of which each needs a
+    matrix of its own.
+    """
+
+    name = "matrix"
+    what_it_does = "predicted by a matrix"
+
+    def find_search_refusal(
+        self, problem: Problem, steps: int, policy: Policy[Any]
+    ) -> Refusal | None:
+        if problem.conditions is not None:
+            return NOTHING_MOVES
+        return find_matrix_refusal(problem, steps, specialise=True)
+
+    def make_search(
+        self,
+        problem: Problem,
+        steps: int,
+        *,
+        collect_light: Evaluate,
+        clean_matrix: CleanMatrix,
+    ) -> PredictedSearch:
+        return Transport(problem, steps, clean_matrix=clean_matrix)
+
+    def make_sweep_method(self, renderer: Renderer, seed: int) -> SweepMethod:
+        return BasisPictures(renderer)

@@ -41,9 +41,9 @@ from advsearch.attacks.trials import (
 )
 from advsearch.cluster import Workers
 from advsearch.engine.journal import Journal, ParallelEvaluator
+from advsearch.engine.prediction import PredictedSearch, make_methods
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import MAX_STORED_IMAGES, RunState
-from advsearch.engine.transport import PredictedSearch
 from advsearch.errors import InputError
 from advsearch.progress import Progress, Stages
 from advsearch.report.wording import format_count as plural
@@ -51,6 +51,7 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.runs.summary import read_configuration
 from advsearch.scene.color import round_to_8_bit
 from advsearch.scene.formation import round_sample_count
+from advsearch.scene.predictor import RefusalCause
 from advsearch.tasks import Judgement
 
 # The row of a trial has the values of its configuration if these are at most this many.
@@ -330,6 +331,44 @@ class Verifier:
         if not with_new_trials:
             self.run_state.clean_trials = verification.clean_trials
         return verification
+
+    def prepare_predictor(self, u: Tensor, coordinates: Tensor, n_images: int) -> None:
+        """Prepare a predictor of trials, if one is cheaper than rendering them.
+
+        The trials vary some coordinates of a configuration. If a method can follow
+        these, accurately enough and at less cost than rendering, the state gets it as
+        `predictor`. Else the state gets the reason as `predictor_refusal`, unless the
+        method is for other coordinates.
+
+        Args:
+            u: (d,) the configuration.
+            coordinates: (k,) indices of the coordinates that vary.
+            n_images: about how many trials there are.
+        """
+        state = self.run_state
+        for method in make_methods():
+            refusal = method.find_trials_refusal(
+                self.problem, coordinates, state.spp, n_images
+            )
+            if refusal is None:
+                predictor = method.make_trials(self.problem, u, coordinates)
+                self._prepare_trials(predictor)
+            elif refusal.cause is not RefusalCause.NOTHING_MOVES:
+                state.predictor_refusal = refusal
+            if state.predictor is not None:
+                return
+
+    def _prepare_trials(self, predictor: PredictedSearch) -> None:
+        """Prepare a predictor of trials, and store it or why it is not used."""
+        stages = self.progress_stages
+        hint = "`specialise=false` leaves it out"
+        stages.begin("transport", predictor.title, predictor.preparation_spp, hint=hint)
+        # It compares predicted images with traced ones, and may refuse.
+        predictor.prepare(stages.progress.advance)
+        refusal = predictor.accuracy_refusal
+        self.run_state.predictor_refusal = refusal
+        if refusal is None:
+            self.run_state.predictor = predictor
 
     def try_configurations(
         self,

@@ -28,9 +28,13 @@ from advsearch.engine.acceptance import (
 )
 from advsearch.engine.problem import Problem
 from advsearch.scene.assembly import IMAGE_INPUTS
-from advsearch.scene.predictor import NOISE, Refusal, RefusalCause
+from advsearch.scene.predictor import (
+    NOISE,
+    Refusal,
+    RefusalCause,
+    find_changed_inputs,
+)
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.surface.renderer import find_changed_inputs
 from advsearch.scene.transport.lights import HAZE, find_light_inputs
 from advsearch.scene.window import Window
 

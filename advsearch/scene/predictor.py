@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -113,6 +113,41 @@ def inputs_differ(first: Tensor | None, second: Tensor | None) -> bool:
         or first.shape != second.shape
         or not torch.equal(first, second)
     )
+
+
+def find_changed_inputs(renderer: Renderer, varying: Collection[str]) -> frozenset[str]:
+    """Return the names of the scene inputs that some controls change.
+
+    All coordinates of these controls are set to one value, one of a few fractions of
+    their range after another, and the inputs are compared with those of the start.
+
+    Args:
+        renderer: renderer of the scene.
+        varying: names of controls, or of groups of coordinates such as "pose.yaw".
+    """
+    changed: set[str] = set()
+    with torch.no_grad():
+        start_inputs = renderer.scene.input_assembler(
+            renderer.space.inputs(renderer.start)
+        )
+        for fraction in PROBE_FRACTIONS:
+            u = _set_varying_to_fraction(renderer, varying, fraction)
+            inputs = renderer.scene.input_assembler(renderer.space.inputs(u))
+            for name in start_inputs.keys() | inputs.keys():
+                if inputs_differ(start_inputs.get(name), inputs.get(name)):
+                    changed.add(name)
+    return frozenset(changed)
+
+
+def _set_varying_to_fraction(
+    renderer: Renderer, varying: Collection[str], fraction: float
+) -> Tensor:
+    """Return the start (d,) with the coordinates of some controls at a fraction."""
+    u = renderer.start.clone()
+    for group in renderer.space.groups:
+        if group.control in varying or group.name in varying:
+            u[group.coordinates] = fraction
+    return u
 
 
 class LinearMap(torch.autograd.Function):

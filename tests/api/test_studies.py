@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from advsearch.engine.transport import CleanMatrix
+from advsearch.engine.prediction import CleanMatrix
 from advsearch.experiment import RunContext, run_and_save
 from advsearch.questions.attack import studies
 from advsearch.questions.attack.settings import AttackConfig

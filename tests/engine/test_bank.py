@@ -7,13 +7,16 @@ import pytest
 import torch
 
 import advsearch
+from advsearch.api import prediction
 from advsearch.attacks.domain import Block, Domain
-from advsearch.engine import acceptance, bank
-from advsearch.engine.bank import Bank, sample_condition
+from advsearch.engine import acceptance
+from advsearch.engine.prediction import sample_condition
 from advsearch.engine.problem import compute_condition_weights
+from advsearch.predictors import bank
+from advsearch.predictors.bank import Bank
+from advsearch.predictors.surface_light import renderer as surface_renderer
 from advsearch.questions.attack.result import AttackResult
 from advsearch.scene.predictor import Refusal
-from advsearch.scene.surface import renderer as surface_renderer
 from stand_ins import Impatient, rows
 
 SMALL: dict[str, Any] = {
@@ -136,7 +139,7 @@ def test_its_pictures_are_those_that_are_traced(monkeypatch: pytest.MonkeyPatch)
 @pytest.mark.usefixtures("growing")
 def test_the_oldest_conditions_make_room(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where there is memory for two or three, the newest are kept and nothing fails."""
-    monkeypatch.setattr(bank, "MAX_BYTES", 150_000)
+    monkeypatch.setattr(prediction, "MAX_BYTES", 150_000)
     kept: list[list[int]] = []
     drawn = Bank._choose_conditions
 

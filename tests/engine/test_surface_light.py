@@ -8,15 +8,16 @@ from typing import Any
 import pytest
 
 import advsearch
-from advsearch.engine import acceptance, surface_light
+from advsearch.engine import acceptance
 from advsearch.engine.acceptance import Deviation
-from advsearch.engine.surface_light import SurfaceLight
+from advsearch.predictors.surface_light import arrangement, texels
+from advsearch.predictors.surface_light import search as surface_search
+from advsearch.predictors.surface_light.search import SurfaceLight
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.run import attack_once
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
-from advsearch.scene.surface import arrangement, texels
 from stand_ins import Impatient, rows, shared
 
 pytestmark = pytest.mark.medium
@@ -42,7 +43,7 @@ def coarse() -> Iterator[None]:
         for name, value in {"OBJECT_TEXELS": 48, "RAYS_PER_TEXEL": 64}.items():
             patched.setattr(arrangement, name, value)
         for name, count in {"N_LIGHTS": 3, "COMPARISON_INTERVAL": 6}.items():
-            patched.setattr(surface_light, name, count)
+            patched.setattr(surface_search, name, count)
         for name, number in {"CHECK_SPP": 4, "MIN_ALLOWED_LEVELS": 50.0, "MAX_MARGIN_BIAS": 50.0}.items():
             patched.setattr(acceptance, name, number)
         yield

@@ -7,10 +7,9 @@ import pytest
 
 import advsearch
 from advsearch.attacks.domain import ProductIndex
-from advsearch.engine import acceptance
-from advsearch.questions.sweep import predicting
+from advsearch.engine import acceptance, transport
+from advsearch.engine.image_groups import Groups
 from advsearch.questions.sweep.job import SweptScene
-from advsearch.questions.sweep.predicting import Groups
 from advsearch.runs.results import LinearTransport
 from stand_ins import rows
 
@@ -21,7 +20,7 @@ GRID = {"camera.exposure": [-10, -1, 6], "light.power": "0:6:8"}
 @pytest.fixture(autouse=True)
 def _paying(monkeypatch: pytest.MonkeyPatch) -> None:
     """A few dozen pictures are enough here, and the first two views of a comparison decide."""
-    monkeypatch.setattr(predicting, "MIN_SAVING_FACTOR", 0.2)
+    monkeypatch.setattr(transport, "MIN_SAVING_FACTOR", 0.2)
     for name in ("MIN_ALLOWED_LEVELS", "MAX_MARGIN_BIAS"):
         monkeypatch.setattr(acceptance, name, 50.0)
 

@@ -9,20 +9,20 @@ import pytest
 import torch
 
 import advsearch
+from advsearch.api import prediction
 from advsearch.attacks.domain import ProductIndex
 from advsearch.cluster import BatchResult, WorkerStats
 from advsearch.engine import acceptance
+from advsearch.engine.image_groups import Groups
 from advsearch.engine.journal import make_worker_call
+from advsearch.predictors.surface_light import arrangement, texels
+from advsearch.predictors.surface_light.renderer import SurfaceRenderer
 from advsearch.progress import NullProgress
-from advsearch.questions.sweep import predicting
 from advsearch.questions.sweep.carry_out import load_job
 from advsearch.questions.sweep.job import SceneLoader, SweptScene
 from advsearch.questions.sweep.loop import Sweep
-from advsearch.questions.sweep.predicting import Groups
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
-from advsearch.scene.surface import arrangement, texels
-from advsearch.scene.surface.renderer import SurfaceRenderer
 from stand_ins import rows
 
 SMALL: dict[str, Any] = {"resolution": 24, "trials": 0, "batch": 4}
@@ -34,7 +34,7 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[SurfaceRenderer]]:
     monkeypatch.setattr(texels, "GROUND_TEXELS", 24)
     for name, value in {"OBJECT_TEXELS": 32, "RAYS_PER_TEXEL": 48}.items():
         monkeypatch.setattr(arrangement, name, value)
-    monkeypatch.setattr(predicting, "MIN_SAVING_FACTOR", 0.0)
+    monkeypatch.setattr(prediction, "MIN_SAVING_FACTOR", 0.0)
     for name, number in {"CHECK_SPP": 2, "MIN_ALLOWED_LEVELS": 50.0, "MAX_MARGIN_BIAS": 50.0}.items():
         monkeypatch.setattr(acceptance, name, number)
     made, make = list[SurfaceRenderer](), SurfaceRenderer.__init__

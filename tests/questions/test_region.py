@@ -7,12 +7,12 @@ from typing import Any
 import pytest
 
 from advsearch.engine import acceptance
+from advsearch.predictors import surface_light
+from advsearch.predictors.surface_light import arrangement, texels
 from advsearch.questions.region import boxes, growing, region
 from advsearch.questions.region.result import RegionConfig, RegionResult
-from advsearch.questions.sweep import predicting
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
-from advsearch.scene.surface import arrangement, texels
 from stand_ins import Impatient, rows
 
 pytestmark = pytest.mark.medium
@@ -31,7 +31,7 @@ def coarse() -> Iterator[None]:
         for module, name, value in (
             (arrangement, "OBJECT_TEXELS", 48), (arrangement, "RAYS_PER_TEXEL", 64), (acceptance, "CHECK_SPP", 4),
             (acceptance, "MIN_ALLOWED_LEVELS", 50.0), (acceptance, "MAX_MARGIN_BIAS", 50.0), (boxes, "MAX_PROBED", 20),
-            (predicting, "find_break_even", lambda *_: 1),
+            (surface_light, "find_break_even", lambda *_: 1),
         ):  # fmt: skip
             patched.setattr(module, name, value)
         yield

@@ -8,6 +8,7 @@ import torch
 
 from advsearch.engine.acceptance import compute_level_errors
 from advsearch.engine.gradients import make_smooth_loss
+from advsearch.predictors.surface_light.renderer import SurfaceRenderer
 from advsearch.questions.stability.result import CaseOutcome, check_condition, check_range
 from advsearch.questions.stability.scene import (
     REFERENCE_SPP,
@@ -20,7 +21,6 @@ from advsearch.questions.stability.scene import (
 )
 from advsearch.questions.stability.scenes import FLASH
 from advsearch.scene.assets import EnvironmentAsset
-from advsearch.scene.surface.renderer import SurfaceRenderer
 
 TRACED = 256
 """Samples a pixel of the traced pictures."""

@@ -16,10 +16,10 @@ from torch import Tensor
 
 import advsearch
 from advsearch.controls.geometry import _Solve
+from advsearch.predictors.surface_light.arrangement import multiply_sparse
 from advsearch.scene.color import LINEAR_LIMIT, linear_to_srgb
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.mitsuba_backend.transport import PathVertices
-from advsearch.scene.surface.arrangement import multiply_sparse
 from advsearch.scene.transport.matrix import CELL_SIZE, TextureTransport
 
 ROUNDED = 2e-3

@@ -41,10 +41,11 @@ from advsearch.engine.judging import (
 )
 from advsearch.engine.loading import Controls, Scene, fit_camera
 from advsearch.engine.naming import AnyModel, load_models, to_model_list
+from advsearch.engine.prediction import CleanMatrix
 from advsearch.engine.problem import Problem
 from advsearch.engine.rendering import make_facts
 from advsearch.engine.shared_paths import find_shared_paths
-from advsearch.engine.transport import CleanMatrix, find_matrix_refusal
+from advsearch.engine.transport import find_matrix_refusal
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model

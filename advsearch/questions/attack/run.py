@@ -22,9 +22,9 @@ from advsearch.attacks.verification import OVER_LOOKS, TRIAL_LOOKS
 from advsearch.controls.base import describe_adjusted_defaults
 from advsearch.engine.journal import Journal, ParallelEvaluator, check_digests
 from advsearch.engine.loading import Scene
+from advsearch.engine.prediction import CleanMatrix
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import RunState
-from advsearch.engine.transport import CleanMatrix
 from advsearch.engine.verifier import Verifier, choose_ladder
 from advsearch.errors import InputError
 from advsearch.interrupts import reraise_lost_interrupt

@@ -32,19 +32,21 @@ from advsearch.attacks.candidates import (
     find_smallest_change,
 )
 from advsearch.attacks.evaluation import Query
-from advsearch.engine import surface_light
-from advsearch.engine.bank import Bank
 from advsearch.engine.crop import CroppedSearch
 from advsearch.engine.gradients import planning
 from advsearch.engine.gradients.bench import Bench, find_interior_point
 from advsearch.engine.journal import PLAN_NOTE, Journal
 from advsearch.engine.judging import subtract_print_penalty
-from advsearch.engine.problem import Problem
-from advsearch.engine.record import RunState
-from advsearch.engine.surface_light import SurfaceLight
-from advsearch.engine.transport import (
+from advsearch.engine.prediction import (
     CleanMatrix,
     PredictedSearch,
+    PredictionMethod,
+    find_general_refusal,
+    make_methods,
+)
+from advsearch.engine.problem import Problem
+from advsearch.engine.record import RunState
+from advsearch.engine.transport import (
     Transport,
     find_matrix_refusal,
     make_rendering_remark,
@@ -58,6 +60,8 @@ from advsearch.scene.predictor import Refusal, RefusalCause
 from advsearch.scene.transport.matrix import TransportTooLargeError
 from advsearch.tasks import Judgement
 
+# Causes of refusals which would not help the user: another method is the right one.
+UNHELPFUL_CAUSES = (RefusalCause.NOTHING_MOVES, RefusalCause.NO_CAMERA)
 MAX_FRAMES = 60  # frames in the animation of a search
 N_RANKED = 4  # best configurations of a search that are rendered again
 UNPRINTED = "search without print terms"
@@ -155,11 +159,28 @@ def _pays_to_measure_bounces(
     has_enough_renders = problem.steps >= planning.MIN_RENDERS_FOR_BOUNCES
     if not (is_full or has_enough_renders):
         return False
-    refusal = surface_light.find_surface_light_refusal(
-        problem, problem.steps, policy, specialise=True
-    )
-    can_surface_light_predict = refusal is None
-    return not can_surface_light_predict
+    if problem.renderer.composition_reason:  # then nothing predicts the images
+        return True
+    # methods whose images have all bounces, so that leaving some out changes nothing
+    methods = [method for method in make_methods() if not method.follows_bounces]
+    return not _select_usable(methods, problem, policy)
+
+
+def _select_usable(
+    methods: Sequence[PredictionMethod], problem: Problem, policy: Policy[Any]
+) -> list[PredictionMethod]:
+    """Return those of some methods that may predict the images of a search.
+
+    Args:
+        methods: the methods.
+        problem: problem of the search, whose images are not composed of several.
+        policy: policy of the search.
+    """
+    return [
+        method
+        for method in methods
+        if method.find_search_refusal(problem, problem.steps, policy) is None
+    ]
 
 
 def _pays_to_measure_gradients(
@@ -361,12 +382,11 @@ def choose_predictor(
 ) -> PredictedSearch | None:
     """Prepare and return the cheapest predictor that is accurate here.
 
-    A predictor replaces renders by something faster: a matrix of light transport, or a
-    bank of matrices if conditions vary, or light on surfaces. Predictors are tried in
-    turn, the cheapest first. If one is too inaccurate, the next one is tried. If one
-    takes too much memory, no other one is tried. A refusal is the reason why a
-    predictor is not used, or None if it may be used. Refusals are stored in `findings`
-    and reported.
+    A predictor replaces renders by something faster, such as a matrix of light
+    transport. Predictors are tried in turn, the cheapest first. If one is too
+    inaccurate, the next one is tried. If one takes too much memory, no other one is
+    tried. A refusal is the reason why a predictor is not used, or None if it may be
+    used. Refusals are stored in `findings` and reported.
 
     Args:
         policy: policy of the search.
@@ -381,38 +401,28 @@ def choose_predictor(
         step is rendered in full.
     """
     problem = journal.problem
-    matrix_refusal = find_matrix_refusal(problem, problem.steps, specialise)
-    surface_refusal = surface_light.find_surface_light_refusal(
-        problem, problem.steps, policy, specialise
-    )
-    can_use_matrices = matrix_refusal is None
-    can_use_surface_light = surface_refusal is None
-    candidates = _list_candidates(
-        journal,
-        clean,
-        can_use_matrices=can_use_matrices,
-        can_use_surface_light=can_use_surface_light,
-    )
-    for make_predictor in candidates:
-        predictor = make_predictor()
+    refusal = find_general_refusal(problem, specialise)
+    if refusal is not None:
+        return _render_search(problem, refusal, stages, findings, specialise=specialise)
+    methods = make_methods()
+    candidates = _select_usable(methods, problem, policy)
+    for index, method in enumerate(candidates):
+        predictor = method.make_search(
+            problem,
+            problem.steps,
+            collect_light=journal.evaluator,
+            clean_matrix=clean,
+        )
         refusal = _prepare(predictor, stages)
         if refusal is None:
             return predictor
         if refusal.cause is RefusalCause.TOO_LARGE:
             return _crop_search(problem, refusal, stages, findings)
-        # It is light on surfaces: matrices are never refused for their accuracy here.
-        surface_refusal = refusal
-        findings.surface_light_refusal = refusal
-        _report_inaccuracy(refusal, stages, can_use_matrices=can_use_matrices)
+        findings.inaccuracy_refusal = refusal
+        _report_inaccuracy(refusal, stages, candidates[index + 1 :])
 
-    # If matrices could be used, the loop has returned. Light on surfaces was refused
-    # before the loop or in it.
-    assert matrix_refusal is not None and surface_refusal is not None
-    reports_matrix_refusal = _is_matrix_refusal_more_helpful(
-        problem, surface_refusal, findings, specialise=specialise
-    )
-    refusal = matrix_refusal if reports_matrix_refusal else surface_refusal
-    return _render_search(problem, refusal, stages, findings, specialise=specialise)
+    refusal = _choose_refusal(methods, problem, policy, findings)
+    return _crop_search(problem, refusal, stages, findings)
 
 
 def _render_search(
@@ -437,65 +447,45 @@ def _render_search(
 
 
 def _report_inaccuracy(
-    refusal: Refusal, stages: Stages, *, can_use_matrices: bool
+    refusal: Refusal, stages: Stages, next_methods: Sequence[PredictionMethod]
 ) -> None:
-    """Report that light on surfaces is too inaccurate, and what replaces it."""
-    # The next candidate, if there is one, is the bank of matrices.
-    instead = "predicted by matrices" if can_use_matrices else "rendered"
+    """Report that a predictor is too inaccurate, and what replaces it."""
+    instead = next_methods[0].what_it_does if next_methods else "rendered"
     stages.progress.message(f"Pictures are {instead}: {refusal}.")
 
 
-def _list_candidates(
-    journal: Journal,
-    clean: CleanMatrix,
-    *,
-    can_use_matrices: bool,
-    can_use_surface_light: bool,
-) -> list[Callable[[], PredictedSearch]]:
-    """Return the functions that make the usable predictors, the cheapest first.
+def _choose_refusal(
+    methods: Sequence[PredictionMethod],
+    problem: Problem,
+    policy: Policy[Any],
+    findings: RunState,
+) -> Refusal:
+    """Return the refusal to report if no method predicts the images of a search.
+
+    Only one reason is reported: that of matrices, or that of another method. The user
+    can act on the refusal of matrices if they need only more steps. If no camera moves,
+    light on surfaces would not help anyway.
 
     Args:
-        journal: journal of the run.
-        clean: the matrix of light transport of the clean scene, which attacks may share.
-        can_use_matrices: whether nothing speaks against matrices of light transport.
-        can_use_surface_light: whether nothing speaks against light on surfaces.
-    """
-    problem = journal.problem
-    steps = problem.steps
-    if can_use_matrices and problem.conditions is None:
-        # a single matrix predicts all images, if no condition varies
-        return [lambda: Transport(problem, steps, clean_matrix=clean)]
-    candidates: list[Callable[[], PredictedSearch]] = []
-    if can_use_surface_light:
-        candidates.append(lambda: SurfaceLight(problem, steps))
-    if can_use_matrices:
-        candidates.append(lambda: Bank(problem, steps, journal.evaluator))
-    return candidates
-
-
-def _is_matrix_refusal_more_helpful(
-    problem: Problem, surface_refusal: Refusal, findings: RunState, *, specialise: bool
-) -> bool:
-    """Return whether to report the refusal of matrices instead of that of surface light.
-
-    Neither predicts the images, and only one reason is reported. The user can act on
-    the refusal of matrices if they need only more steps. If no camera moves, light on
-    surfaces would not help anyway.
-
-    Args:
+        methods: all methods.
         problem: problem of the attack.
-        surface_refusal: why light on surfaces does not predict the images.
-        findings: findings of the attack.
-        specialise: whether images may be predicted.
+        policy: policy of the search.
+        findings: findings of the attack, with a method that was tried and inaccurate.
     """
-    # stored only if light on surfaces was tried and was inaccurate
-    was_inaccurate = findings.surface_light_refusal is not None
-    refusal_with_any_steps = find_matrix_refusal(
-        problem, steps=None, specialise=specialise
-    )
-    pays_with_more_steps = not was_inaccurate and refusal_with_any_steps is None
-    moves_no_camera = surface_refusal.cause is RefusalCause.NO_CAMERA
-    return pays_with_more_steps or moves_no_camera
+    matrix_refusal = find_matrix_refusal(problem, problem.steps, specialise=True)
+    if matrix_refusal is None:
+        # A matrix could predict each condition, but the predictor that does is missing.
+        matrix_refusal = Refusal("conditions vary, and there is no predictor `bank`")
+    if findings.inaccuracy_refusal is not None:
+        return findings.inaccuracy_refusal
+    if find_matrix_refusal(problem, steps=None, specialise=True) is None:
+        return matrix_refusal
+    for method in methods:
+        refusal = method.find_search_refusal(problem, problem.steps, policy)
+        if refusal is not None and refusal.cause not in UNHELPFUL_CAUSES:
+            if refusal != matrix_refusal:
+                return refusal
+    return matrix_refusal
 
 
 def _crop_search(

@@ -26,9 +26,9 @@ from advsearch.cluster.workers import open_workers
 from advsearch.engine.journal import make_worker_call
 from advsearch.engine.judging import find_label_warnings
 from advsearch.engine.naming import check_distinct, load_models
+from advsearch.engine.prediction import CleanMatrix
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import make_control_group, make_verified_rate
-from advsearch.engine.transport import CleanMatrix
 from advsearch.engine.verifier import RetrialCondition, Retrials
 from advsearch.errors import ClusterError, FileFormatError
 from advsearch.experiment import ResultType, RunContext, run_part

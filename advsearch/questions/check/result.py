@@ -9,10 +9,8 @@ from pydantic import Field
 
 from advsearch.extend import (
     DerivativeConfig,
-    ResultPart,
     RunResult,
     SceneConfig,
-    ShownResult,
     results,
     setting,
     setting_as_in,
@@ -247,7 +245,7 @@ LOSSES = {
 }
 
 
-def make_check_view(result: CheckResult) -> ShownResult:
+def make_check_view(result: CheckResult) -> views.ShownResult:
     """Return the view of a check.
 
     It has tables of derivatives, of the model's gradients, of the plan of a search, and
@@ -255,26 +253,28 @@ def make_check_view(result: CheckResult) -> ShownResult:
     """
     gradient_rows = [row for row in result.rows if row.quantity == "gradient"]
     sections = [
-        ResultPart(text=[READING] if result.rows else []),
+        views.ResultPart(text=[READING] if result.rows else []),
         *_make_derivative_tables(result),
-        ResultPart.make_table(
+        views.ResultPart.make_table(
             gradient_rows,
             GRADIENT_COLUMNS,
             title="The model's loss, cosine with the converged gradient",
         ),
-        ResultPart.make_table(
+        views.ResultPart.make_table(
             result.plan.groups if result.plan else [],
             GROUP_COLUMNS,
             title="How a search gets its derivatives",
             text=_reason_texts(result),
         ),
-        ResultPart("Left out", _left_out_texts(result)),
-        ResultPart.make_table(result.gains, GAIN_COLUMNS, title="What that saves"),
+        views.ResultPart("Left out", _left_out_texts(result)),
+        views.ResultPart.make_table(
+            result.gains, GAIN_COLUMNS, title="What that saves"
+        ),
     ]
-    return ShownResult(_verdict(result), sections, _list_costs(result))
+    return views.ShownResult(_verdict(result), sections, _list_costs(result))
 
 
-def _make_derivative_tables(result: CheckResult) -> list[ResultPart]:
+def _make_derivative_tables(result: CheckResult) -> list[views.ResultPart]:
     """Return a table of derivatives for each loss."""
     tables = []
     for loss, title in LOSSES.items():
@@ -284,7 +284,7 @@ def _make_derivative_tables(result: CheckResult) -> list[ResultPart]:
             if row.loss == loss and row.quantity == "derivative"
         ]
         tables.append(
-            ResultPart.make_table(derivatives, DERIVATIVE_COLUMNS, title=title)
+            views.ResultPart.make_table(derivatives, DERIVATIVE_COLUMNS, title=title)
         )
     return tables
 

@@ -9,7 +9,12 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field
 
-from advsearch.extend import ResultPart, RunResult, ShownResult, results, views, wording
+from advsearch.extend import (
+    RunResult,
+    results,
+    views,
+    wording,
+)
 
 
 class ComparedSide(results.CountedPredictions):
@@ -209,7 +214,7 @@ MAX_PICTURES = 3
 """Number of pairs that a terminal shows for each side; the page shows all."""
 
 
-def make_compare_view(result: CompareResult) -> ShownResult:
+def make_compare_view(result: CompareResult) -> views.ShownResult:
     """Return the view of a comparison.
 
     It has a table of all sides, then sections for each pair.
@@ -223,10 +228,12 @@ def make_compare_view(result: CompareResult) -> ShownResult:
     sweeps = ", ".join(dict.fromkeys(side.run for side in result.sides))
     facts = {"sweeps": sweeps, "they differ in": ", ".join(result.differ)}
     # `says_interrupted`: the summary itself states that the run was interrupted.
-    return ShownResult(summary, sections, facts, says_interrupted=not result.pairs)
+    return views.ShownResult(
+        summary, sections, facts, says_interrupted=not result.pairs
+    )
 
 
-def _make_side_table(result: CompareResult) -> ResultPart:
+def _make_side_table(result: CompareResult) -> views.ResultPart:
     """Return the table of how often each side is right."""
     columns: dict[str, views.Column] = {
         "": lambda side: side.name,
@@ -241,7 +248,9 @@ def _make_side_table(result: CompareResult) -> ResultPart:
         columns["the others"] = lambda side: wording.format_outcomes(
             side.outcomes, result.task
         )
-    return ResultPart.make_table(result.sides, columns, title="How often each is right")
+    return views.ResultPart.make_table(
+        result.sides, columns, title="How often each is right"
+    )
 
 
 def format_prediction_time(seconds: float) -> str:
@@ -290,7 +299,7 @@ def describe_exclusive_pairs(pair: ComparedPair) -> str:
 
 def _make_pair_sections(
     pair: ComparedPair, *, has_others: bool
-) -> Iterator[ResultPart]:
+) -> Iterator[views.ResultPart]:
     """Yield the sections about one pair of sides.
 
     Args:
@@ -302,13 +311,13 @@ def _make_pair_sections(
     if has_others:
         sentences.insert(0, summarize_difference(pair))
     yield _make_pair_table(pair, sentences)
-    yield ResultPart("Where one is worse", [*_describe_rules(pair)])
+    yield views.ResultPart("Where one is worse", [*_describe_rules(pair)])
     yield from _make_parameter_tables(pair)
     for name in (pair.first, pair.second):
         yield from _make_picture_parts(name, pair)
 
 
-def _make_pair_table(pair: ComparedPair, sentences: list[str]) -> ResultPart:
+def _make_pair_table(pair: ComparedPair, sentences: list[str]) -> views.ResultPart:
     """Return the table of one side right or wrong, by the other right or wrong.
 
     Args:
@@ -325,10 +334,12 @@ def _make_pair_table(pair: ComparedPair, sentences: list[str]) -> ResultPart:
         # `units` is their number and `unit` what one is, such as "drive".
         note = UNITS_NOTE.format(units=f"{pair.unit}s")
     title = f"{pair.first} and {pair.second}, pair by pair"
-    return ResultPart(title, text=sentences, column_heads=heads, rows=rows, note=note)
+    return views.ResultPart(
+        title, text=sentences, column_heads=heads, rows=rows, note=note
+    )
 
 
-def _make_parameter_tables(pair: ComparedPair) -> Iterator[ResultPart]:
+def _make_parameter_tables(pair: ComparedPair) -> Iterator[views.ResultPart]:
     """Yield a table for each parameter.
 
     A page shows all tables. A terminal shows those of the `MAX_TABLES` parameters over
@@ -341,14 +352,14 @@ def _make_parameter_tables(pair: ComparedPair) -> Iterator[ResultPart]:
         rows = [_make_part_cells(part) for part in parts]
         # An empty `only` shows the table on the page and in a terminal.
         only = "" if title in titles_in_terminal else "page"
-        yield ResultPart(title, column_heads=heads, rows=rows, only_medium=only)
+        yield views.ResultPart(title, column_heads=heads, rows=rows, only_medium=only)
     n_parameters = len(parts_by_title)
     if len(titles_in_terminal) < n_parameters:
         remark = (
             "The difference varies most over these; the page has all "
             f"{n_parameters} parameters."
         )
-        yield ResultPart(text=[remark], only_medium="text")
+        yield views.ResultPart(text=[remark], only_medium="text")
 
 
 def _list_part_heads(pair: ComparedPair) -> list[str]:
@@ -462,7 +473,7 @@ def _make_captions(example: PairPicture, pair: ComparedPair) -> list[str]:
     return captions
 
 
-def _make_picture_parts(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
+def _make_picture_parts(name: str, pair: ComparedPair) -> Iterator[views.ResultPart]:
     """Yield the images of pairs that only one side gets right.
 
     The part for a terminal has a line for each of the first pairs, with the paths of
@@ -486,8 +497,10 @@ def _make_picture_parts(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
     groups = _join_single_pictures(
         [_group_pictures(example, pair) for example in examples if example.pictures]
     )
-    yield ResultPart(title, rows=text_rows[:MAX_PICTURES], only_medium="text")
-    yield ResultPart(title, lines_without_pictures, pictures=groups, only_medium="page")
+    yield views.ResultPart(title, rows=text_rows[:MAX_PICTURES], only_medium="text")
+    yield views.ResultPart(
+        title, lines_without_pictures, pictures=groups, only_medium="page"
+    )
 
 
 def _describe_example(example: PairPicture, pair: ComparedPair) -> str:

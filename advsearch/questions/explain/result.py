@@ -7,7 +7,12 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from advsearch.extend import ResultPart, RunResult, ShownResult, results, views, wording
+from advsearch.extend import (
+    RunResult,
+    results,
+    views,
+    wording,
+)
 
 
 class RightCounts(results.Fields):
@@ -248,7 +253,7 @@ MAX_LABELS = 3
 """Maximum number of predictions of a cluster in a caption."""
 
 
-def make_explain_view(result: ExplainResult) -> ShownResult:
+def make_explain_view(result: ExplainResult) -> views.ShownResult:
     """Return the view of an explanation.
 
     Its sections are the rules, the weights of the parameters, the box in which the
@@ -256,17 +261,19 @@ def make_explain_view(result: ExplainResult) -> ShownResult:
     """
     sections = [
         _make_rules_part(result),
-        ResultPart.make_table(
+        views.ResultPart.make_table(
             result.importance[:MAX_WEIGHTS],
             WEIGHT_COLUMNS,
             title="What decides",
             note=IMPORTANCE_NOTE,
         ),
-        ResultPart("Where it can be relied on", [describe_envelope(result)]),
+        views.ResultPart("Where it can be relied on", [describe_envelope(result)]),
         *_make_failure_parts(result),
     ]
     about = [result.object, result.model]
-    return ShownResult(_make_headline(result), sections, _list_row_facts(result), about)
+    return views.ShownResult(
+        _make_headline(result), sections, _list_row_facts(result), about
+    )
 
 
 def _list_row_facts(result: ExplainResult) -> dict[str, str]:
@@ -281,7 +288,7 @@ def _list_row_facts(result: ExplainResult) -> dict[str, str]:
     }
 
 
-def _make_rules_part(result: ExplainResult) -> ResultPart:
+def _make_rules_part(result: ExplainResult) -> views.ResultPart:
     """Return the part with all rules in sentences, and the best one that was rejected."""
     rule_sentences = [
         f"{number}. {describe_rule_row(number, rule)}"
@@ -289,13 +296,13 @@ def _make_rules_part(result: ExplainResult) -> ResultPart:
     ]
     rule_sentences.append(describe_rejected_rule(result))  # "" if there is none
     note = RULES_NOTE if result.rules else ""
-    return ResultPart("Rules", rule_sentences, note=note)
+    return views.ResultPart("Rules", rule_sentences, note=note)
 
 
-def _make_failure_parts(result: ExplainResult) -> Iterator[ResultPart]:
+def _make_failure_parts(result: ExplainResult) -> Iterator[views.ResultPart]:
     """Yield the parts about single failures: pairs with a right image, and kinds."""
     if result.pairs_sought:  # the number of failures for which a pair was looked for
-        yield ResultPart("One thing changed", [describe_pairs(result)])
+        yield views.ResultPart("One thing changed", [describe_pairs(result)])
     for pair in result.pairs:
         yield _pair_section(pair)
     if result.clusters:
@@ -315,7 +322,7 @@ def _make_headline(result: ExplainResult) -> str:
     )
 
 
-def _pair_section(pair: NearestRight) -> ResultPart:
+def _pair_section(pair: NearestRight) -> views.ResultPart:
     """Return the sentence and the images of a failure and the nearest right image."""
     unit = "" if pair.unit in wording.PLAIN_UNITS else f" {pair.unit}"
     wrong_value = _format_value(pair.wrong_at)
@@ -330,7 +337,7 @@ def _pair_section(pair: NearestRight) -> ResultPart:
         views.Picture(file, caption)
         for file, caption in zip(pair.pictures, captions, strict=False)
     ]
-    return ResultPart(text=[text], pictures=[pictures])
+    return views.ResultPart(text=[text], pictures=[pictures])
 
 
 def _format_value(value: str | float) -> str:
@@ -433,7 +440,7 @@ def describe_pairs(result: ExplainResult) -> str:
     return text
 
 
-def _cluster_section(clusters: FailureClusters) -> ResultPart:
+def _cluster_section(clusters: FailureClusters) -> views.ResultPart:
     """Return the part of the page about the kinds of failures.
 
     Kinds are clusters of failures. It states how many clusters there are, and has the
@@ -445,7 +452,7 @@ def _cluster_section(clusters: FailureClusters) -> ResultPart:
         labels = ", ".join(f"{label} {count}" for label, count in common_labels)
         pictures.append(views.Picture(cluster.picture, f"{cluster.failures}: {labels}"))
     text = _describe_clusters(clusters)
-    return ResultPart("Kinds of failures", [text], pictures=[pictures])
+    return views.ResultPart("Kinds of failures", [text], pictures=[pictures])
 
 
 def _describe_clusters(clusters: FailureClusters) -> str:

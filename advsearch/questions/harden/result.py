@@ -10,9 +10,7 @@ from pydantic import Field, JsonValue, model_validator
 
 from advsearch.extend import (
     AttackConfig,
-    ResultPart,
     RunResult,
-    ShownResult,
     figures,
     results,
     setting,
@@ -318,13 +316,13 @@ ShareChanges = Mapping[str, tuple[Share | None, Share | None]]
 """Fractions before and after the training, by a description."""
 
 
-def make_harden_view(result: HardenResult) -> ShownResult:
+def make_harden_view(result: HardenResult) -> views.ShownResult:
     """Return the view of a hardening.
 
     The page has all tables; the terminal has the text, the facts and the first table.
     """
     sections = [_make_robustness_part(result), *_make_training_parts(result)]
-    return ShownResult(
+    return views.ShownResult(
         _summarize(result),
         sections,
         _list_facts(result),
@@ -344,17 +342,17 @@ def _list_facts(result: HardenResult) -> dict[str, str]:
     }
 
 
-def _make_training_parts(result: HardenResult) -> list[ResultPart]:
+def _make_training_parts(result: HardenResult) -> list[views.ResultPart]:
     """Return the table of the rounds and that of the split of scenes."""
     return [
-        ResultPart.make_table(
+        views.ResultPart.make_table(
             enumerate(result.rounds),
             ROUND_COLUMNS,
             title="The training",
             note=TRAINING_NOTE,
             only_medium="page",
         ),
-        ResultPart.make_table(
+        views.ResultPart.make_table(
             result.split.items(),
             SPLIT_COLUMNS,
             title="What it was trained and measured on",
@@ -363,14 +361,14 @@ def _make_training_parts(result: HardenResult) -> list[ResultPart]:
     ]
 
 
-def _make_robustness_part(result: HardenResult) -> ResultPart:
+def _make_robustness_part(result: HardenResult) -> views.ResultPart:
     """Return the table of fractions before and after, with a chart if it has rows."""
     shares = _list_shares(result)
     rows = [
         [name, *_share_cells(before), *_share_cells(after)]
         for name, (before, after) in shares.items()
     ]
-    return ResultPart(
+    return views.ResultPart(
         "Before and after",
         column_heads=HEADS,
         rows=rows,

@@ -10,10 +10,8 @@ from pydantic import Field, field_validator
 
 from advsearch.extend import (
     DerivativeConfig,
-    ResultPart,
     RunResult,
     SceneConfig,
-    ShownResult,
     figures,
     results,
     setting,
@@ -306,7 +304,7 @@ REFERENCE_COLUMNS: Mapping[str, views.Column] = {
 }
 
 
-def make_view(result: PrecisionResult) -> ShownResult:
+def make_view(result: PrecisionResult) -> views.ShownResult:
     """Lay out a result: recommendations, errors, slopes and references."""
     headline = make_headline(result)
     if result.is_unfinished:
@@ -321,10 +319,10 @@ def make_view(result: PrecisionResult) -> ShownResult:
         "loss": result.loss,
         "figures": ", ".join(result.figures),
     }
-    return ShownResult(headline, _make_parts(result), context)
+    return views.ShownResult(headline, _make_parts(result), context)
 
 
-def _make_parts(result: PrecisionResult) -> list[ResultPart]:
+def _make_parts(result: PrecisionResult) -> list[views.ResultPart]:
     """Return the lists and tables of a result in their order."""
     recommendations = [
         describe_recommendation(recommendation, result.goal)
@@ -335,28 +333,28 @@ def _make_parts(result: PrecisionResult) -> list[ResultPart]:
         for quantity in ("picture", "margin", "gradient")
     ]
     return [
-        ResultPart("Recommended", recommendations),
+        views.ResultPart("Recommended", recommendations),
         # On a page this note is at the table of references instead.
-        ResultPart(text=[READING_NOTE], only_medium="text"),
+        views.ResultPart(text=[READING_NOTE], only_medium="text"),
         *error_tables,
         _make_slope_table(result),
         _make_reference_table(result),
-        ResultPart("Not measured for lack of time", result.left_out),
+        views.ResultPart("Not measured for lack of time", result.left_out),
     ]
 
 
-def _make_slope_table(result: PrecisionResult) -> ResultPart:
+def _make_slope_table(result: PrecisionResult) -> views.ResultPart:
     """Make the table of how fast the error of each estimator falls with its samples."""
-    return ResultPart.make_table(
+    return views.ResultPart.make_table(
         result.slopes,
         SLOPE_COLUMNS,
         title="Slopes: logarithm of the error against that of samples",
     )
 
 
-def _make_reference_table(result: PrecisionResult) -> ResultPart:
+def _make_reference_table(result: PrecisionResult) -> views.ResultPart:
     """Make the table of the references that errors are measured against."""
-    return ResultPart.make_table(
+    return views.ResultPart.make_table(
         result.references,
         REFERENCE_COLUMNS,
         title="References, with their own errors",
@@ -454,7 +452,9 @@ GRADIENT_COLUMNS = ("control", "cosine")
 """Those that only gradients have."""
 
 
-def _make_error_table(quantity: str, points: Sequence[PrecisionPoint]) -> ResultPart:
+def _make_error_table(
+    quantity: str, points: Sequence[PrecisionPoint]
+) -> views.ResultPart:
     """Make the table of errors of a quantity.
 
     If the error of a point is not known (`has_known_error`), its root mean square is an
@@ -470,7 +470,7 @@ def _make_error_table(quantity: str, points: Sequence[PrecisionPoint]) -> Result
         for name, column in ERROR_COLUMNS.items()
         if quantity == "gradient" or name not in GRADIENT_COLUMNS
     }
-    return ResultPart.make_table(rows, columns, title=quantity.capitalize())
+    return views.ResultPart.make_table(rows, columns, title=quantity.capitalize())
 
 
 def _format_interval(interval: results.Interval | None) -> str:

@@ -11,10 +11,8 @@ from pydantic import Field, JsonValue, field_validator
 
 from advsearch.extend import (
     Config,
-    ResultPart,
     RunResult,
     SceneConfig,
-    ShownResult,
     SweepConfig,
     results,
     setting,
@@ -222,9 +220,9 @@ class RecipeResult(views.InNotebook, RunResult):
         return f"{len(self.figures)} figures"
 
 
-def make_view(result: RecipeResult) -> ShownResult:
+def make_view(result: RecipeResult) -> views.ShownResult:
     """Lay out a result: each figure with its sentences and numbers, then the runs."""
-    sections = [ResultPart(text=[result.about], only_medium="page")]
+    sections = [views.ResultPart(text=[result.about], only_medium="page")]
     sections += _list_figures(result)
     sections.append(_list_runs(result.parts))
     objects = ", ".join(map(wording.shorten_name, result.objects))
@@ -238,29 +236,29 @@ def make_view(result: RecipeResult) -> ShownResult:
     }
     remarks = [QUICK_REMARK] if result.quick else []
     recipe_name = PurePath(result.recipe).stem
-    return ShownResult(
+    return views.ShownResult(
         result.title, sections, facts, [recipe_name, models, objects], remarks
     )
 
 
-def _list_figures(result: RecipeResult) -> list[ResultPart]:
+def _list_figures(result: RecipeResult) -> list[views.ResultPart]:
     """Return a section for each figure, and one for its numbers."""
-    sections = list[ResultPart]()
+    sections = list[views.ResultPart]()
     # the sentences of each figure, without those of earlier figures
     sentences = omit_repeated_sentences(result.figures)
     for number, (figure, text) in enumerate(
         zip(result.figures, sentences, strict=True), start=1
     ):
         image = f"images/figure-{number}.png"
-        sections.append(ResultPart(figure.title, text, figure=image))
+        sections.append(views.ResultPart(figure.title, text, figure=image))
         sections.append(_make_numbers_part(figure))
     return sections
 
 
-def _make_numbers_part(figure: RecipeFigure) -> ResultPart:
+def _make_numbers_part(figure: RecipeFigure) -> views.ResultPart:
     """Make the section with the numbers of a figure."""
     rows = [list(map(_format_cell, figure.columns, row)) for row in figure.rows]
-    return ResultPart(
+    return views.ResultPart(
         "The numbers",
         column_heads=figure.columns,
         rows=rows,
@@ -269,10 +267,10 @@ def _make_numbers_part(figure: RecipeFigure) -> ResultPart:
     )
 
 
-def _list_runs(parts: Sequence[RecipePart]) -> ResultPart:
+def _list_runs(parts: Sequence[RecipePart]) -> views.ResultPart:
     """Make the table of a recipe's runs."""
     rows = [[run.name, run.command, run.ending, str(run.renders)] for run in parts]
-    return ResultPart(
+    return views.ResultPart(
         wording.format_count(len(parts), "run"),
         column_heads=("run in parts/", "command", "ending", "renders"),
         rows=rows,

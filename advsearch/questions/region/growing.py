@@ -278,7 +278,7 @@ class RegionSearch:
         verifier.choose_spp({"centre": varied.center})
         self._is_wrong_at_center = find_verdict(verifier, varied.center)
         if self._config.specialise:
-            self._prepare_light()
+            self._prepare_predictor()
         grown = self._grow_box()
         sides = describe_box(verifier.problem, grown, varied)
         margin_map = self._draw_map_of(sides)
@@ -301,8 +301,8 @@ class RegionSearch:
             return None
         return draw_map(self._verifier, size, self._varied, sides, self._run)
 
-    def _prepare_light(self) -> None:
-        """Prepare the light on surfaces, so that images can be predicted.
+    def _prepare_predictor(self) -> None:
+        """Prepare what predicts images of many cameras, such as light on surfaces.
 
         That pays only for enough images.
         """
@@ -310,8 +310,8 @@ class RegionSearch:
         n_growing_images = boxes.USUAL_PROBED * len(varied.names)
         n_map_images = self._config.map**2  # `map` is its size; 0 for no map
         n_images = n_growing_images + n_map_images
-        workbench.prepare_surface_light(
-            self._verifier, varied.center, varied.coordinate_indices, n_images
+        self._verifier.prepare_predictor(
+            varied.center, varied.coordinate_indices, n_images
         )
 
     def _grow_box(self) -> boxes.GrownBox:

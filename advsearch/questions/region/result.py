@@ -9,9 +9,7 @@ from pydantic import Field
 
 from advsearch.extend import (
     AttackConfig,
-    ResultPart,
     SceneConfig,
-    ShownResult,
     results,
     setting,
     setting_as_in,
@@ -167,15 +165,15 @@ BOX_COLUMNS: Mapping[str, views.Column] = {
 }
 
 
-def make_region_view(result: RegionResult) -> ShownResult:
+def make_region_view(result: RegionResult) -> views.ShownResult:
     """Return the view of a region."""
     if result.box is None or result.interval is None:
-        return ShownResult("Stopped before the box was known.")
-    return ShownResult(
+        return views.ShownResult("Stopped before the box was known.")
+    return views.ShownResult(
         f"The model is {result.verdict} in {result.n_same} of {result.samples} fresh "
         "samples of this box: with 95 % "
         f"confidence in at least {wording.percent(result.interval[0])} of it.",
-        [ResultPart.make_table(result.box, BOX_COLUMNS, title="The box")],
+        [views.ResultPart.make_table(result.box, BOX_COLUMNS, title="The box")],
         {
             "share of the space": wording.percent(result.volume),
             "samples a pixel": str(result.spp or ""),

@@ -11,9 +11,7 @@ from pydantic import Field, field_validator
 from advsearch.extend import (
     AttackConfig,
     Config,
-    ResultPart,
     SceneConfig,
-    ShownResult,
     results,
     setting,
     setting_as_in,
@@ -303,9 +301,9 @@ def describe_transfer(transfer: PhotographTransfer, kind: str = "other") -> str:
     )
 
 
-def make_replay_view(result: ReplayResult) -> ShownResult:
+def make_replay_view(result: ReplayResult) -> views.ShownResult:
     """Return the table of conditions, for a terminal or a page."""
-    table = ResultPart(
+    table = views.ResultPart(
         "Under other conditions",
         column_heads=HEADS,
         rows=[make_cells(row) for row in result.table],
@@ -317,7 +315,7 @@ def make_replay_view(result: ReplayResult) -> ShownResult:
         ", ".join(result.controls),
     ]
     facts = {"attack": result.adversarial_run, "model": result.model}
-    return ShownResult(summarize_replay(result), [table], facts, about)
+    return views.ShownResult(summarize_replay(result), [table], facts, about)
 
 
 def make_cells(row: ReplayRow) -> list[str]:

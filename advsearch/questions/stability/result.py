@@ -15,9 +15,7 @@ from pydantic import Field
 from advsearch.extend import (
     Config,
     InputError,
-    ResultPart,
     SceneConfig,
-    ShownResult,
     results,
     setting,
     setting_as_in,
@@ -201,7 +199,7 @@ CASE_COLUMNS: Mapping[str, views.Column] = {
 }
 
 
-def make_view(result: StabilityResult) -> ShownResult:
+def make_view(result: StabilityResult) -> views.ShownResult:
     """Return the view of a result: cases, condition numbers, and failed cases.
 
     A row's `holds` states what must hold, and `decides` the check that failed.
@@ -213,13 +211,15 @@ def make_view(result: StabilityResult) -> ShownResult:
         for row in result.rows
         if row.status != OK
     ]
-    return ShownResult(
+    return views.ShownResult(
         f"{n_rows - len(failures)} of {n_rows} cases hold, in {seconds:.0f} seconds.",
         [
-            ResultPart.make_table(result.rows, CASE_COLUMNS, title="Cases"),
-            ResultPart("Condition numbers", rows=_list_condition_numbers(result.rows)),
-            ResultPart("Short", failures),  # cases that "fell short"
-            ResultPart("Not run", [", ".join(result.not_run)]),
+            views.ResultPart.make_table(result.rows, CASE_COLUMNS, title="Cases"),
+            views.ResultPart(
+                "Condition numbers", rows=_list_condition_numbers(result.rows)
+            ),
+            views.ResultPart("Short", failures),  # cases that "fell short"
+            views.ResultPart("Not run", [", ".join(result.not_run)]),
         ],
     )
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -21,425 +21,23 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Query
-from advsearch.attacks.domain import ProductIndex
 from advsearch.engine.acceptance import (
-    CHECK_SPP,
-    N_VIEWS,
     ComparedView,
     Deviation,
     compare_views,
     compare_with_traced,
 )
+from advsearch.engine.image_groups import Groups
+from advsearch.engine.prediction import SweepMethod, make_methods
 from advsearch.engine.problem import Problem
-from advsearch.engine.surface_light import N_LIGHTS, SurfaceLight
-from advsearch.engine.verifier import Verifier
 from advsearch.questions.sweep.axes import Axis, SceneConfigurations
 from advsearch.runs.results import LinearTransport, PredictionError
-from advsearch.scene.assembly import IMAGE_INPUTS
 from advsearch.scene.color import round_to_8_bit
-from advsearch.scene.mitsuba_backend.surface import RAYS_PER_PIXEL
 from advsearch.scene.predictor import (
-    MAX_BYTES,
-    NOISE,
     NOTHING_MOVES,
     Predictor,
     Refusal,
-    RefusalCause,
 )
-from advsearch.scene.renderer import Renderer
-from advsearch.scene.surface.arrangement import (
-    CAMERA_INPUTS,
-    COLOR_INPUT,
-    ENVIRONMENT_INPUT,
-    FREE_INPUTS,
-)
-from advsearch.scene.surface.renderer import (
-    SurfaceRenderer,
-    find_changed_inputs,
-    find_scene_refusal,
-)
-from advsearch.scene.transport.lights import (
-    BasisRenderer,
-    LightBasis,
-    find_light_groups,
-)
-from advsearch.scene.transport.matrix import COLLECTED_SPP
-from advsearch.trust.stored_files import scale_limit
-
-MIN_SAVING_FACTOR = 2.0
-"""A group is predicted if rendering it takes at least this many times the samples of a
-prediction, including the comparisons.
-"""
-
-
-BASIS_PIXEL_BYTES = 8  # approximate memory of a pixel of a basis image
-
-
-class Groups:
-    """Divides the images of a scene into groups, each of which one predictor serves.
-
-    Images of a group differ along some axes, those *within* groups, and have the same
-    index along the others, those *between* groups.
-
-    Args:
-        grid: grid of the sweep.
-        samples: number of samples at each point of the grid.
-        within: for each axis of the grid, whether images of a group may differ along
-            it.
-        may_draws_differ: whether images of a group may differ in what is sampled. If
-            not, they differ along no axis but `frame_axis`, since other images have
-            other draws.
-        frame_axis: the index of the axis with the frames of a drive, which have one
-            draw; None without a drive.
-
-    Attributes:
-        group_size: number of images of a group.
-        n_groups: number of groups.
-        n_groups_to_cache: number of groups to cache so that no predictor is made
-            twice if images come in order: 1 if the images of a group follow each other.
-    """
-
-    def __init__(
-        self,
-        grid: ProductIndex,
-        samples: int,
-        within: tuple[bool, ...],
-        may_draws_differ: bool,
-        frame_axis: int | None = None,
-    ) -> None:
-        """Split the axes into those within and those between groups; see the class."""
-        self.grid = grid
-        self.samples = samples
-        # Samples are like one more axis, the last and fastest.
-        self._all_axes = ProductIndex((*grid.sizes, samples))
-        # Two images along any axis but that of the frames have different draws.
-        is_within = [
-            may_differ and (may_draws_differ or axis == frame_axis)
-            for axis, may_differ in enumerate(within)
-        ]
-        # The samples, whose axis is the last, have different draws, too.
-        self._is_within = (*is_within, may_draws_differ)
-        within_sizes = self._select(self._all_axes.sizes, is_within=True)
-        between_sizes = self._select(self._all_axes.sizes, is_within=False)
-        self._within = ProductIndex(tuple(within_sizes))
-        self._between = ProductIndex(tuple(between_sizes))
-        self.group_size = self._within.count
-        self.n_groups = self._between.count
-        self.n_groups_to_cache = self._count_alternating_groups()
-
-    def _count_alternating_groups(self) -> int:
-        """Return how many groups alternate when images come in order.
-
-        The last axis is the fastest. If an axis between groups comes after an axis
-        within groups, the images visit all groups along it, and then come back to the
-        first one. For example, let the images of a group differ in light. With the axes
-        (light 10, pose 3), 3 groups alternate; with (pose 3, light 10) it is 1.
-        """
-        n_groups = 1
-        was_axis_within = False
-        for size, is_within in zip(self._all_axes.sizes, self._is_within, strict=True):
-            if is_within:
-                was_axis_within = True
-            elif was_axis_within:
-                n_groups *= size
-        return n_groups
-
-    def _select(self, values: Sequence[int], *, is_within: bool) -> list[int]:
-        """Select the values that belong to axes within groups, or to those between.
-
-        `values` has one for each axis, that of the samples last.
-        """
-        return [
-            value
-            for value, within in zip(values, self._is_within, strict=True)
-            if within == is_within
-        ]
-
-    def find_group_of_image(self, number: int) -> int:
-        """Return the index of the group of an image of the scene."""
-        digits = self._all_axes.digits(number)
-        return self._between.index(self._select(digits, is_within=False))
-
-    def find_image_of_group(self, number: int, index: int) -> int:
-        """Return the number of an image, by its index in the group of another image.
-
-        Both images have the same index along every axis between groups. The index in
-        the group counts along the axes within groups, the last one fastest.
-
-        Args:
-            number: number of any image of the group, in the scene.
-            index: index of the image to find in the group, in [0, group_size).
-        """
-        # The digits of a number are the indices along the axes (mixed radix).
-        member_digits = list(self._all_axes.digits(number))
-        within_axes = [
-            axis for axis, is_within in enumerate(self._is_within) if is_within
-        ]
-        for axis, digit in zip(within_axes, self._within.digits(index), strict=True):
-            member_digits[axis] = digit
-        return self._all_axes.index(member_digits)
-
-
-MakeGroups = Callable[[frozenset[str]], Groups]
-"""Returns the groups whose images may differ in the named parameters, each given as
-"control.parameter", and in no others.
-"""
-
-
-class BasisPictures:
-    """Predicts images at one size of a scene by a basis image of each light.
-
-    Images of a group differ only in the strength of lights: they are weighted sums of
-    the basis images.
-
-    Attributes:
-        parameters: names (control.parameter) of the parameters in which images of a
-            group may differ.
-        changes_scene: whether a parameter among these changes more than the finished
-            image, as exposure does.
-    """
-
-    name = "basis pictures"
-    samples = COLLECTED_SPP
-    """Samples per pixel of a basis image."""
-    bytes = 0
-    """Memory that groups share."""
-
-    def __init__(self, renderer: Renderer, seed: int) -> None:
-        self._renderer = renderer
-        self._lighting = find_light_groups(renderer)
-        self.parameters = frozenset(self._lighting.inputs_by_group)
-        self.changes_scene = any(self._lighting.inputs_by_group.values())
-
-    def find_refusal(self, make_groups: MakeGroups, spp: int) -> Refusal | None:
-        """Return why images are rendered; None if they are predicted.
-
-        Images are predicted if that takes at most 1 / `MIN_SAVING_FACTOR` of the
-        samples that rendering a group takes, and if the basis images fit into memory.
-
-        Args:
-            make_groups: returns the groups whose images differ in some parameters.
-            spp: samples per pixel of the images.
-        """
-        groups = make_groups(self.parameters)
-        # Only an image without noise can be predicted from basis images.
-        is_denoised = self._renderer.formation.denoiser == "oidn"
-        if not is_denoised:
-            return NOISE
-        n_lights = self._count_lights()
-        prediction_samples = n_lights * COLLECTED_SPP + _count_check_samples(spp)
-        # Rendering a group takes `spp` for each image.
-        min_images = math.ceil(MIN_SAVING_FACTOR * prediction_samples / spp)
-        if groups.group_size < min_images:
-            return Refusal(
-                f"basis pictures pay where {min_images} pictures or more differ in "
-                f"light alone; here {groups.group_size} do"
-            )
-        return self._find_memory_refusal(groups, n_lights)
-
-    def _count_lights(self) -> int:
-        """Count the lights, whose number is the same in all configurations."""
-        renderer = self._renderer
-        start_inputs = renderer.space.inputs(renderer.start)
-        inputs = renderer.scene.input_assembler(start_inputs)
-        return len(LightBasis(renderer, self._lighting, inputs).inputs_of_light)
-
-    def _find_memory_refusal(self, groups: Groups, n_lights: int) -> Refusal | None:
-        """Return a refusal if the basis images take too much memory; else None."""
-        height, width = self._renderer.formation.resolution
-        bytes_per_basis_image = BASIS_PIXEL_BYTES * height * width
-        n_bytes = groups.n_groups_to_cache * n_lights * bytes_per_basis_image
-        if n_bytes > scale_limit(MAX_BYTES):
-            return Refusal(
-                f"basis pictures of {groups.n_groups} groups take too much memory; "
-                "make "
-                "light the last axes of the grid"
-            )
-        return None
-
-    def make_predictor(self, u: Tensor, seed: int) -> Predictor:
-        """Return the predictor of the images of a group.
-
-        Args:
-            u: (d,) configuration of any image of the group: they differ only in light,
-                which the predictor takes from the image to predict.
-            seed: seed of the light paths of its basis images.
-        """
-        return BasisRenderer(self._renderer, u, seed, changing=self._lighting)
-
-
-ARRANGEMENT_SAMPLES = 2_200_000
-LIGHT_SAMPLES = 80_000
-"""Costs, as the number of rendered samples that take as long: of an arrangement (what
-texels of the surfaces see of each other), and of an environment's light on them.
-
-They take 0.8 s and 0.03 s; an image of 128 x 128 pixels with 8 samples per pixel takes
-46 ms.
-"""
-PREDICTION_SPP = 0.8  # samples per pixel that take as long as a predicted image
-ARRANGEMENT_BYTES = 50_000_000  # approximate memory of an arrangement
-LIGHT_BYTES = 4_000_000  # approximate memory of an environment's light, without its map
-
-
-def _count_check_samples(spp: int) -> int:
-    """Return how many samples per pixel the comparison with traced images takes.
-
-    Of each of the `N_VIEWS` compared images two halves are traced, to estimate the
-    noise, and once the image itself, with `spp`.
-    """
-    return N_VIEWS * (2 * CHECK_SPP + spp)
-
-
-def find_break_even(renderer: Renderer, spp: int, arrangements: float = 1.0) -> int:
-    """Return the number of images under one light for which light on surfaces pays.
-
-    Preparing the light and comparing it with traced images has a fixed cost; each image
-    that is predicted saves `spp - PREDICTION_SPP`. The light is used if the images save
-    `MIN_SAVING_FACTOR` times the fixed cost. All costs are in samples per pixel.
-
-    Args:
-        renderer: renderer of the images.
-        spp: samples per pixel of the images, at least 1.
-        arrangements: number of arrangements that are found for each light; below 1 if
-            several lights share one. An arrangement is what surfaces see of each other.
-    """
-    height, width = renderer.formation.resolution
-    preparation_samples = ARRANGEMENT_SAMPLES * arrangements + LIGHT_SAMPLES
-    fixed_spp = preparation_samples / (height * width) + _count_check_samples(spp)
-    return math.ceil(MIN_SAVING_FACTOR * fixed_spp / (spp - PREDICTION_SPP))
-
-
-class LightOnSurfaces:
-    """Predicts images at one size of a scene by light that is stored on surfaces.
-
-    Images of a group differ only in the camera. Groups in which object and surroundings
-    do not move share an *arrangement*: what their surfaces see of each other. Its rays
-    are the same for every group, so that it does not matter which group is first.
-
-    Attributes:
-        parameters: names (control.parameter) of the parameters in which images of a
-            group may differ.
-        changes_scene: whether a parameter among these moves the camera.
-    """
-
-    name = "surface light"
-    samples = RAYS_PER_PIXEL
-
-    def __init__(self, renderer: Renderer, seed: int) -> None:
-        """Find the parameters that move nothing but the camera.
-
-        Args:
-            renderer: renderer of the images.
-            seed: seed from which the rays of all arrangements follow.
-        """
-        self._renderer = renderer
-        self._seed = seeds.derive_seed(seed, "surface light")
-        # An arrangement is where object and surroundings are.
-        self._arrangements: list[SurfaceRenderer] = []
-        self._max_arrangements = 0  # `find_refusal` sets it
-        # which inputs of the scene change with each parameter
-        self._changed_inputs = {
-            group.name: find_changed_inputs(renderer, [group.name])
-            for group in renderer.space.groups
-        }
-        self.parameters = self._find_parameters_changing_only(CAMERA_INPUTS)
-        # `parameters` includes those that change only the finished image.
-        self.changes_scene = any(
-            self._changed_inputs[name] & CAMERA_INPUTS for name in self.parameters
-        )
-
-    def _find_parameters_changing_only(self, inputs: frozenset[str]) -> frozenset[str]:
-        """Return the names of the parameters that change nothing but these inputs.
-
-        A change of the finished image, such as exposure, is allowed, too: it is applied
-        to predicted images as to rendered ones.
-        """
-        allowed = inputs | IMAGE_INPUTS
-        return frozenset(
-            name for name, changed in self._changed_inputs.items() if changed <= allowed
-        )
-
-    def find_refusal(self, make_groups: MakeGroups, spp: int) -> Refusal | None:
-        """Return why images are rendered; None if they are predicted.
-
-        They are predicted if enough images share their light, the scene has nothing
-        that light on surfaces cannot do, and arrangements and light fit into memory. As
-        a side effect this sets how many arrangements are cached.
-
-        Args:
-            make_groups: returns the groups whose images differ in some parameters.
-            spp: samples per pixel of the images.
-        """
-        # The images of one of these groups have the same light.
-        light_groups = make_groups(self.parameters)
-        # The images of one of these groups have the same arrangement: neither object
-        # nor surroundings move, and the object has one color.
-        parameters = self._find_parameters_changing_only(FREE_INPUTS - {COLOR_INPUT})
-        arrangement_groups = make_groups(parameters)
-        self._max_arrangements = arrangement_groups.n_groups_to_cache
-        # below 1 if several lights share an arrangement
-        arrangements_per_light = arrangement_groups.n_groups / light_groups.n_groups
-        min_images = find_break_even(self._renderer, spp, arrangements_per_light)
-        if light_groups.group_size < min_images:
-            return Refusal(
-                f"light on surfaces pays where {min_images} pictures differ in the "
-                f"camera alone; here {light_groups.group_size} do"
-            )
-        refusal = find_scene_refusal(self._renderer)
-        if refusal is not None:
-            return refusal
-        return self._find_light_memory_refusal(arrangement_groups, light_groups)
-
-    def _find_light_memory_refusal(
-        self, arrangement_groups: Groups, light_groups: Groups
-    ) -> Refusal | None:
-        """Return a refusal if arrangements and light take too much memory; else None.
-
-        Args:
-            arrangement_groups: groups whose images have the same arrangement.
-            light_groups: groups whose images have the same light.
-        """
-        environment = self._renderer.scene.get_base_value(ENVIRONMENT_INPUT)
-        light_bytes = LIGHT_BYTES + 4 * environment.numel()  # 4 bytes for a float32
-        n_bytes = (
-            arrangement_groups.n_groups_to_cache * ARRANGEMENT_BYTES
-            + light_groups.n_groups_to_cache * light_bytes
-        )
-        if n_bytes > scale_limit(MAX_BYTES):
-            return Refusal(
-                f"light of {light_groups.n_groups} groups takes too much memory; make the "
-                "camera the last axes of the grid"
-            )
-        return None
-
-    def make_predictor(self, u: Tensor, seed: int) -> Predictor:
-        """Return the predictor of the images of a group.
-
-        The arrangement of another group is reused if object and surroundings have not
-        moved. Else a new one is made and cached; if too many are cached, the one that
-        was made first is released.
-
-        Args:
-            u: (d,) configuration of any image of the group: they differ only in the
-                camera, which the predictor takes from the image to predict.
-            seed: not used; all arrangements have the same rays.
-        """
-        with torch.no_grad():
-            space_inputs = self._renderer.space.inputs(u)
-            inputs = self._renderer.scene.input_assembler(space_inputs)
-            for arrangement in self._arrangements:
-                if arrangement.is_applicable(inputs):
-                    return arrangement.with_fixed_light(inputs)
-            if len(self._arrangements) >= self._max_arrangements:
-                self._arrangements.pop(0)
-            arrangement = SurfaceRenderer(self._renderer, u, self._seed)
-            self._arrangements.append(arrangement)
-            return arrangement.with_fixed_light(inputs)
-
-    @property
-    def bytes(self) -> int:
-        """Memory of the arrangements."""
-        return sum(arrangement.n_bytes for arrangement in self._arrangements)
 
 
 @dataclass(frozen=True, eq=False)
@@ -498,7 +96,7 @@ class SweepPredictor:
         self.method, self.refusal = self._choose_method()
         self._groups = self._make_groups(self.method.parameters)
 
-    def _choose_method(self) -> tuple[BasisPictures | LightOnSurfaces, Refusal | None]:
+    def _choose_method(self) -> tuple[SweepMethod, Refusal | None]:
         """Choose the method that predicts images.
 
         Returns:
@@ -507,9 +105,11 @@ class SweepPredictor:
             which could predict something that varies, since its reason says what to
             change; else the last one.
         """
-        refused: list[tuple[BasisPictures | LightOnSurfaces, Refusal]] = []
-        for method_type in (BasisPictures, LightOnSurfaces):  # cheapest first
-            method = method_type(self.renderer, self.seed)
+        refused: list[tuple[SweepMethod, Refusal]] = []
+        for prediction_method in make_methods():  # cheapest first
+            method = prediction_method.make_sweep_method(self.renderer, self.seed)
+            if method is None:
+                continue
             refusal = self._find_refusal(method)
             if refusal is None:
                 return method, None
@@ -520,7 +120,7 @@ class SweepPredictor:
                 return method, refusal
         return refused[-1]
 
-    def _find_refusal(self, method: BasisPictures | LightOnSurfaces) -> Refusal | None:
+    def _find_refusal(self, method: SweepMethod) -> Refusal | None:
         """Return why a method does not predict these images; None if it does."""
         if not method.changes_scene:
             return NOTHING_MOVES
@@ -805,78 +405,3 @@ def combine_transport(
     }
     # The other fields, such as the method, are the same in all scenes.
     return with_predictions[0].model_copy(update=update)
-
-
-def prepare_surface_light(
-    verifier: Verifier, at: Tensor, coordinates: Tensor, n_images: int
-) -> None:
-    """Prepare light on surfaces for trials, if that is cheaper than rendering them.
-
-    The trials vary some coordinates of a configuration. If light on surfaces can follow
-    these, accurately enough and at less cost than rendering, the verifier's state gets
-    it as `predictor`. If the camera moves, but the light is not used, the state gets
-    the reason as `predictor_refusal`.
-
-    Args:
-        verifier: verifier of the trials, whose sample count is known.
-        at: (d,) the configuration.
-        coordinates: (k,) indices of the coordinates that vary.
-        n_images: about how many trials there are.
-    """
-    problem = verifier.problem
-    if not _can_light_follow(problem, coordinates):
-        return
-    state = verifier.run_state
-    refusal = _find_light_refusal(problem.renderer, state.spp, n_images)
-    state.predictor_refusal = refusal
-    if refusal is not None:
-        return
-    title = "finding the light on surfaces"
-    hint = "`specialise=false` leaves it out"
-    verifier.progress_stages.begin("transport", title, N_LIGHTS, hint=hint)
-    light = SurfaceLight(problem, 0, light_u=at, moving_coordinates=coordinates)
-    # `prepare` compares predicted images with traced ones, and may refuse.
-    light.prepare(verifier.progress_stages.progress.advance)
-    state.predictor_refusal = light.accuracy_refusal
-    is_accurate = light.accuracy_refusal is None
-    state.predictor = light if is_accurate else None
-
-
-def _can_light_follow(problem: Problem, coordinates: Tensor) -> bool:
-    """Return whether the camera moves, and light on surfaces can follow what varies.
-
-    Args:
-        problem: problem of the trials.
-        coordinates: (k,) indices of the coordinates that vary.
-    """
-    varying = set(coordinates.tolist())
-    # the parameters that have any of these coordinates
-    parameter_names = [
-        group.name
-        for group in problem.space.groups
-        if not varying.isdisjoint(range(group.begin, group.begin + group.size))
-    ]
-    changed_inputs = find_changed_inputs(problem.renderer, parameter_names)
-    moves_camera = bool(changed_inputs & CAMERA_INPUTS)
-    # light on surfaces cannot follow a change of any other input
-    can_follow = changed_inputs <= FREE_INPUTS
-    return moves_camera and can_follow
-
-
-def _find_light_refusal(renderer: Renderer, spp: int, n_images: int) -> Refusal | None:
-    """Return why light on surfaces is not tried; None if it is.
-
-    Args:
-        renderer: renderer of the images.
-        spp: samples per pixel of the images.
-        n_images: number of images under one light.
-    """
-    refusal = find_scene_refusal(renderer)
-    if refusal is not None:
-        return refusal
-    min_images = find_break_even(renderer, spp)
-    if n_images >= min_images:
-        return None
-    reason = f"light on surfaces pays from {min_images} pictures on"
-    # The cause is named after an attack, in which each image is a step.
-    return Refusal(reason, RefusalCause.TOO_FEW_STEPS)

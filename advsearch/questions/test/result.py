@@ -15,10 +15,8 @@ from pydantic import Field
 
 from advsearch.extend import (
     AttackConfig,
-    ResultPart,
     RunResult,
     SceneConfig,
-    ShownResult,
     SweepConfig,
     __version__,
     results,
@@ -169,7 +167,7 @@ NOT_TESTED = "not tested, since a counterexample failed"
 NOT_TESTED_YET = "not tested yet"
 
 
-def make_view(result: SuiteResult) -> ShownResult:
+def make_view(result: SuiteResult) -> views.ShownResult:
     """Lay out a result for the terminal and the page.
 
     First comes a table of all claims, then a section for each claim that is not held,
@@ -181,15 +179,15 @@ def make_view(result: SuiteResult) -> ShownResult:
         was_not_tested = claim.cause is Cause.COUNTEREXAMPLE_FAILED
         if claim.verdict != HELD and not was_not_tested:
             sections.append(_make_claim_section(claim))
-    sections.append(ResultPart("Expected from now on", result.changes))
+    sections.append(views.ResultPart("Expected from now on", result.changes))
     subject = [Path(result.suite).name, result.object, result.model]
     summary = f"{result.title}. {describe_suite(result)}"
-    return ShownResult(summary, sections, list_facts(result), subject)
+    return views.ShownResult(summary, sections, list_facts(result), subject)
 
 
-def _make_claims_part(result: SuiteResult) -> ResultPart:
+def _make_claims_part(result: SuiteResult) -> views.ResultPart:
     """Make the table of all claims."""
-    return ResultPart(
+    return views.ResultPart(
         "The claims",
         column_heads=TABLE_HEADS,
         rows=make_table_rows(result),
@@ -198,14 +196,14 @@ def _make_claims_part(result: SuiteResult) -> ResultPart:
     )
 
 
-def _make_claim_section(claim: ClaimResult) -> ResultPart:
+def _make_claim_section(claim: ClaimResult) -> views.ResultPart:
     """Make the section of a claim: its picture, and the command that repeats it."""
     pictures = []
     if claim.picture:
         caption = f"{claim.statement}: {claim.verdict}. {claim.reason}."
         pictures.append([views.Picture(claim.picture, caption)])
     rows = [["repeat", claim.repeat]]
-    return ResultPart(claim.name, rows=rows, pictures=pictures)
+    return views.ResultPart(claim.name, rows=rows, pictures=pictures)
 
 
 def describe_claim(claim: AnyClaim, config: SceneConfig) -> str:

@@ -10,9 +10,7 @@ from pydantic import Field, JsonValue, field_validator
 
 from advsearch.extend import (
     Config,
-    ResultPart,
     SceneConfig,
-    ShownResult,
     results,
     setting,
     setting_as_in,
@@ -348,7 +346,7 @@ def _make_photograph_cells(row: results.TwinAgreement, name: str) -> list[str]:
     ]
 
 
-def make_agreement_part(table: Sequence[results.TwinAgreement]) -> ResultPart:
+def make_agreement_part(table: Sequence[results.TwinAgreement]) -> views.ResultPart:
     """Return the table over all objects and conditions.
 
     For each model there is a row about the photographs, and then one for each of the
@@ -365,7 +363,7 @@ def make_agreement_part(table: Sequence[results.TwinAgreement]) -> ResultPart:
             rows.append(_make_photograph_cells(total, f"{prefix}{PHOTOGRAPH}"))
         name = f"{prefix}{_name_surroundings(total)}"
         rows.append(_make_agreement_cells(total, name))
-    return ResultPart(
+    return views.ResultPart(
         "How far twins hold", column_heads=HEADS, rows=rows, note=TABLE_NOTE
     )
 
@@ -384,7 +382,9 @@ def _name_surroundings(row: results.TwinAgreement) -> str:
     return f"twin in the environment {row.surroundings}"
 
 
-def _make_group_parts(table: Sequence[results.TwinAgreement]) -> Iterator[ResultPart]:
+def _make_group_parts(
+    table: Sequence[results.TwinAgreement],
+) -> Iterator[views.ResultPart]:
     """Yield the tables by object and by condition."""
     surroundings = list(dict.fromkeys(row.surroundings for row in table))
     for kind in ("object", "condition"):
@@ -392,7 +392,7 @@ def _make_group_parts(table: Sequence[results.TwinAgreement]) -> Iterator[Result
             title = f"By {kind}: {name}"
             heads = (kind, *HEADS[1:])
             rows = _list_group_cells(table, kind, name)
-            yield ResultPart(
+            yield views.ResultPart(
                 title, column_heads=heads, rows=rows, folded=True, only_medium="page"
             )
 
@@ -417,9 +417,9 @@ def _list_group_cells(
     return rows
 
 
-def _make_factor_part(result: TwinsResult) -> ResultPart:
+def _make_factor_part(result: TwinsResult) -> views.ResultPart:
     """Return the table of how often twins disagree, by parts of each factor."""
-    return ResultPart(
+    return views.ResultPart(
         "What goes with disagreement",
         column_heads=("", "from", "disagree", "rate"),
         rows=[_make_factor_cells(part) for part in result.factors],
@@ -444,7 +444,7 @@ def _format_factor(value: float) -> str:
     return f"{value:.0f}" if abs(value) >= 10.0 else f"{value:.2f}"
 
 
-def make_twins_view(result: TwinsResult) -> ShownResult:
+def make_twins_view(result: TwinsResult) -> views.ShownResult:
     """Return the table, what explains disagreement, and the pairs."""
     facts = {
         "photographs": result.photographs,
@@ -452,7 +452,7 @@ def make_twins_view(result: TwinsResult) -> ShownResult:
     }
     about = [result.photographs, result.model]
     if not result.table:
-        return ShownResult(
+        return views.ShownResult(
             "Interrupted before anything was compared.",
             facts=facts,
             about=about,
@@ -460,7 +460,7 @@ def make_twins_view(result: TwinsResult) -> ShownResult:
         )
     sections = [make_agreement_part(result.table), *_make_group_parts(result.table)]
     sections += [_make_factor_part(result), *_make_pair_parts(result)]
-    return ShownResult(summarize_twins(result.table), sections, facts, about)
+    return views.ShownResult(summarize_twins(result.table), sections, facts, about)
 
 
 def _describe_overlap(result: TwinsResult) -> str:
@@ -518,7 +518,7 @@ def _describe_wrong_twins(composed: results.TwinAgreement) -> str:
     )
 
 
-def _make_pair_parts(result: TwinsResult) -> Iterator[ResultPart]:
+def _make_pair_parts(result: TwinsResult) -> Iterator[views.ResultPart]:
     """Yield the displayed pairs, for a terminal and for a page."""
     title = "Worst disagreements first"
     has_several_models = "," in result.model
@@ -535,8 +535,8 @@ def _make_pair_parts(result: TwinsResult) -> Iterator[ResultPart]:
         ]
         lines.append(f"{name}: {'; '.join(texts)}")
         groups.append(_list_pair_pictures(pair, name, texts))
-    yield ResultPart(title, lines[:MAX_TEXT_PAIRS], only_medium="text")
-    yield ResultPart(title, pictures=groups, only_medium="page")
+    yield views.ResultPart(title, lines[:MAX_TEXT_PAIRS], only_medium="text")
+    yield views.ResultPart(title, pictures=groups, only_medium="page")
 
 
 def _list_pair_pictures(

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from advsearch.engine.loading import Scene, load_scene
+from advsearch.predictors.surface_light import arrangement, texels
+from advsearch.predictors.surface_light.renderer import SurfaceRenderer, find_refusal
+from advsearch.predictors.surface_light.texels import prepare_sky
 from advsearch.scene.library import load_object
 from advsearch.scene.predictor import RefusalCause
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.surface import arrangement, texels
-from advsearch.scene.surface.renderer import SurfaceRenderer, find_refusal
-from advsearch.scene.surface.texels import prepare_sky
 from small_models import levels
 
 SIDE = 32

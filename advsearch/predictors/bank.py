@@ -11,26 +11,20 @@ import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from advsearch import seeds
-from advsearch.attacks import Evaluate, Evaluation
-from advsearch.attacks.domain import Domain, SampleSequence
-from advsearch.attacks.evaluation import Query, WhichGradient
-from advsearch.attacks.policies.sampling import to_domain
-from advsearch.engine.acceptance import ComparedView
-from advsearch.engine.transport import PredictedSearch
-from advsearch.runs.results import BankOfConditions
-from advsearch.scene.color import round_to_8_bit
-from advsearch.scene.predictor import MAX_BYTES
-from advsearch.scene.transport.matrix import (
-    LinearizedScene,
-    LinearRenderer,
-    ProgressCallback,
+from advsearch.extend import (
+    Policy,
+    Problem,
+    color,
+    prediction,
+    results,
+    seeds,
+    stored_files,
 )
-from advsearch.trust.stored_files import scale_limit
 
 # initial number of conditions in the bank, as a multiple of those of an evaluation
 INITIAL_CONDITIONS = 8
@@ -45,31 +39,6 @@ N_COMPARED = 16
 MIN_STANDARD_ERRORS = 1.0
 SPP = 4  # samples per pixel of a condition's light (see `problem.LIGHT_DEPTH`)
 BATCH_SIZE = 16  # images in a batch of the model
-MAX_SOBOL_DIM = 64  # coordinates of a condition up to which conditions are stratified
-
-
-def sample_condition(domain: Domain, index: int, seed: int) -> Tensor:
-    """Return the condition (d,) with an index, out of evenly spread ones.
-
-    Conditions are points of a scrambled Sobol sequence, which covers their range better
-    than independent samples; each is still uniformly distributed. Independent samples
-    are taken if there are too many coordinates for the sequence, or if a block is an L2
-    ball, which is no box.
-
-    Args:
-        domain: domain of the conditions.
-        index: index in the sequence; a bank takes 0, 1, 2, ...
-        seed: seed of the sequence.
-    """
-    has_l2_block = any(block.norm == "l2" for block in domain.blocks)
-    if domain.dim > MAX_SOBOL_DIM or has_l2_block:
-        generator = torch.Generator().manual_seed(
-            seeds.derive_seed(seed, "bank condition", index)
-        )
-        return domain.sample(generator)[0]
-    sequence = SampleSequence(domain.dim, "sobol", seed, "bank conditions")
-    point = sequence.points(index, 1)[0]
-    return to_domain(domain, torch.from_numpy(point).float())
 
 
 def _compare_means(
@@ -108,7 +77,7 @@ class Condition:
 
     index: int
     u: Tensor
-    renderer: LinearRenderer
+    renderer: prediction.LinearRenderer
     depends_on_searched_only: bool
 
 
@@ -133,7 +102,7 @@ def _predict_image_under(
 
 
 @dataclass
-class Bank(PredictedSearch):
+class Bank(prediction.PredictedSearch):
     """The matrices of a run whose searches have random conditions.
 
     The bank begins with some conditions, and grows during the search. At regular
@@ -147,7 +116,7 @@ class Bank(PredictedSearch):
             that under unseen conditions.
     """
 
-    collect_light: Evaluate
+    collect_light: prediction.Evaluate
     draws_conditions: bool = field(default=True, kw_only=True)
     n_renewals: int | None = field(default=None, kw_only=True)
     growth_steps: list[int] = field(default_factory=list)
@@ -158,9 +127,9 @@ class Bank(PredictedSearch):
     _grown_at: dict[int, Tensor] = field(default_factory=dict)
     # inputs of the newest matrix, to share tensors that are equal
     _latest_inputs: dict[str, Tensor] = field(default_factory=dict)
-    _image_renderer: LinearRenderer | None = None
+    _image_renderer: prediction.LinearRenderer | None = None
     # light that is being collected, for conditions up to `_collected_until`
-    _incoming: Iterator[Evaluation] = field(default_factory=lambda: iter(()))
+    _incoming: Iterator[prediction.Evaluation] = field(default_factory=lambda: iter(()))
     _collected_until: int = 0
     _bytes: int = 0
     _latest_step: int = 0
@@ -174,23 +143,23 @@ class Bank(PredictedSearch):
         entries = sum(condition.renderer.n_entries for condition in self._conditions)
         return entries, self._bytes
 
-    def summarize_conditions(self) -> BankOfConditions:
+    def summarize_conditions(self) -> results.BankOfConditions:
         """Return how the bank has grown, and the gap of its latest comparison.
 
         The gap is the mean objective under conditions of the bank minus that under
         unseen ones.
         """
-        return BankOfConditions(
+        return results.BankOfConditions(
             created=self._count_conditions(self._latest_step),
             dropped=self._n_dropped,
             grown=len(self.growth_steps),
             gap=self.gaps[-1] if self.gaps else None,
         )
 
-    def prepare(self, tick: ProgressCallback = lambda samples: None) -> None:
+    def prepare(self, tick: prediction.ProgressCallback = lambda samples: None) -> None:
         self._fill(0, tick)
 
-    def replay(self, query: Query) -> None:
+    def replay(self, query: prediction.Query) -> None:
         """Bring the bank to the state in which a query is evaluated.
 
         At every `COMPARISON_INTERVAL`-th query of a search, the bank is compared with
@@ -209,7 +178,7 @@ class Bank(PredictedSearch):
             # read from the store.
             self._render_image(query.u)
 
-    def evaluate(self, query: Query) -> Evaluation:
+    def evaluate(self, query: prediction.Query) -> prediction.Evaluation:
         """Evaluate a query by its mean over conditions of the bank.
 
         If the image is requested, it shows the scene without random conditions.
@@ -220,11 +189,16 @@ class Bank(PredictedSearch):
         evaluation = self._evaluate_under(conditions, query.u, query.gradient)
         if not query.includes_image:
             return evaluation
-        return replace(evaluation, picture=round_to_8_bit(self._render_image(query.u)))
+        return replace(
+            evaluation, picture=color.round_to_8_bit(self._render_image(query.u))
+        )
 
     def _evaluate_under(
-        self, conditions: Sequence[Condition], u: Tensor, gradient: WhichGradient
-    ) -> Evaluation:
+        self,
+        conditions: Sequence[Condition],
+        u: Tensor,
+        gradient: prediction.WhichGradient,
+    ) -> prediction.Evaluation:
         """Evaluate u by its mean over conditions of the bank.
 
         Args:
@@ -342,7 +316,7 @@ class Bank(PredictedSearch):
         n_draws = n_growing_steps * draws_per_step
         return n_initial + n_draws // DRAWS_PER_CONDITION
 
-    def _make_query(self, condition_index: int) -> Query:
+    def _make_query(self, condition_index: int) -> prediction.Query:
         """Return the query that collects the light of the condition with an index.
 
         A matrix is exact near the configuration at which its light is collected. The
@@ -355,11 +329,13 @@ class Bank(PredictedSearch):
         assert self.problem.conditions is not None
         u = self._find_light_configuration(condition_index)
         bank_seed = seeds.derive_seed(self.problem.seed, "bank")
-        condition = sample_condition(
+        condition = prediction.sample_condition(
             self.problem.conditions, condition_index, bank_seed
         )
         seed = seeds.derive_seed(self.problem.seed, "bank matrix", condition_index)
-        return Query(torch.cat([u, condition]), seed, spp=SPP, requested_output="light")
+        return prediction.Query(
+            torch.cat([u, condition]), seed, spp=SPP, requested_output="light"
+        )
 
     def _find_light_configuration(self, condition_index: int) -> Tensor:
         """Return u (d,) at which the light of a condition is collected."""
@@ -373,7 +349,9 @@ class Bank(PredictedSearch):
                 u = self._grown_at[growth_step]
         return u
 
-    def _fill(self, index: int, tick: ProgressCallback = lambda samples: None) -> None:
+    def _fill(
+        self, index: int, tick: prediction.ProgressCallback = lambda samples: None
+    ) -> None:
         """Make the matrices of all conditions that the bank has by an evaluation.
 
         Args:
@@ -434,11 +412,15 @@ class Bank(PredictedSearch):
 
     def _drop_oldest(self) -> None:
         """Drop the oldest matrices while all take too much memory; one always stays."""
-        while len(self._conditions) > 1 and self._bytes > scale_limit(MAX_BYTES):
+        while len(self._conditions) > 1 and self._bytes > stored_files.scale_limit(
+            prediction.MAX_BYTES
+        ):
             self._bytes -= self._conditions.pop(0).renderer.n_bytes
             self._n_dropped += 1
 
-    def _make_condition(self, number: int, light: LinearizedScene | None) -> Condition:
+    def _make_condition(
+        self, number: int, light: prediction.LinearizedScene | None
+    ) -> Condition:
         """Return the condition with an index, with the matrix of its light.
 
         Args:
@@ -516,7 +498,7 @@ class Bank(PredictedSearch):
 
     def _compare_condition_view(
         self, conditions: Sequence[Condition], u: Tensor, seed: int, number: int
-    ) -> ComparedView:
+    ) -> prediction.ComparedView:
         """Compare the predicted image of u (d,) under a condition with traced ones.
 
         There may be more views than conditions, which are then used again.
@@ -556,7 +538,31 @@ class Bank(PredictedSearch):
             # one seed for both the condition and the noise
             draw_seed = seeds.derive_seed(seed, "draw", index)
             full_u = self.problem.make_full_configuration(u, draw_seed)
-            query = Query(u, draw_seed)  # without a gradient
+            query = prediction.Query(u, draw_seed)  # without a gradient
             evaluation, _ = self.problem.evaluate_full(query, full_u, draw_seed)
             objectives.append(evaluation.objective)
         return objectives
+
+
+class BankMethod(prediction.PredictionMethod):
+    """Predicts searches with random conditions by a matrix for each of some of them."""
+
+    name = "bank"
+    what_it_does = "predicted by matrices"
+
+    def find_search_refusal(
+        self, problem: Problem, steps: int, policy: Policy[Any]
+    ) -> prediction.Refusal | None:
+        if problem.conditions is None:
+            return prediction.NOTHING_MOVES
+        return prediction.find_matrix_refusal(problem, steps, specialise=True)
+
+    def make_search(
+        self,
+        problem: Problem,
+        steps: int,
+        *,
+        collect_light: prediction.Evaluate,
+        clean_matrix: prediction.CleanMatrix,
+    ) -> prediction.PredictedSearch:
+        return Bank(problem, steps, collect_light)

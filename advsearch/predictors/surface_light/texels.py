@@ -26,10 +26,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from advsearch.scene.assets import BoolArray, Float32Array, Float64Array, IntArray
-from advsearch.scene.mitsuba_backend.texel_rays import TexelGrid
-from advsearch.scene.raster import BORDER_TEXELS, Charts, rasterize_charts
-from advsearch.scene.transport.matrix import to_torch_csr
+from advsearch.extend import assets, prediction
+from advsearch.predictors.surface_light.texel_rays import TexelGrid
 
 GROUND_TEXELS = 112  # texels along each side of the ground
 # Half the width of the ground that has texels, in object sizes. The ground beyond has
@@ -57,12 +55,14 @@ class LitTexels:
     """
 
     grids: tuple[TexelGrid, ...]  # grid of each surface, the searched one first
-    positions: Float32Array  # (n, 3) positions in world space
-    normals: Float32Array  # (n, 3)
+    positions: assets.Float32Array  # (n, 3) positions in world space
+    normals: assets.Float32Array  # (n, 3)
     cell_of_texel: (
-        IntArray  # (n,) index of each texel's cell, among the cells of all grids
+        assets.IntArray  # (n,) index of each texel's cell, among the cells of all grids
     )
-    texel_of_cell: IntArray  # (cells of all grids,) index of each cell's nearest texel
+    texel_of_cell: (
+        assets.IntArray
+    )  # (cells of all grids,) index of each cell's nearest texel
     # index of the first texel of each grid, followed by the number of all texels
     first_texels: tuple[int, ...]
 
@@ -103,9 +103,9 @@ def join_texels(surfaces: Sequence[LitTexels]) -> LitTexels:
 
 def make_mesh_texels(
     name: str,
-    charts: Charts,
-    vertices: Float32Array,
-    normals: Float32Array,
+    charts: prediction.Charts,
+    vertices: assets.Float32Array,
+    normals: assets.Float32Array,
     side: int = 0,
 ) -> LitTexels:
     """Return the texels over a mesh.
@@ -194,7 +194,7 @@ def _find_ground_rate(half_width: float) -> float:
 
 def _compute_ground_positions(
     rate: float, scale: float, height: float, center: tuple[float, float]
-) -> Float32Array:
+) -> assets.Float32Array:
     """Return the positions (n, 3) of the ground's texels; see `make_ground_texels`."""
     axis_position = (np.arange(GROUND_TEXELS) + 0.5) * 2.0 / GROUND_TEXELS - 1.0
     axis_offset = scale * np.sinh(rate * axis_position)
@@ -231,10 +231,10 @@ class _SurfacePoints(NamedTuple):
         normal: (N, 3) at the points.
     """
 
-    row: Float64Array
-    column: Float64Array
-    position: Float32Array
-    normal: Float32Array
+    row: assets.Float64Array
+    column: assets.Float64Array
+    position: assets.Float32Array
+    normal: assets.Float32Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,11 +252,13 @@ class _BilateralFilter:
     """
 
     texels: LitTexels
-    charts: Charts
+    charts: prediction.Charts
     texel_width: float
-    buried: BoolArray
+    buried: assets.BoolArray
 
-    def weigh_texels(self, points: _SurfacePoints) -> tuple[IntArray, Float64Array]:
+    def weigh_texels(
+        self, points: _SurfacePoints
+    ) -> tuple[assets.IntArray, assets.Float64Array]:
         """Return the texels whose light counts at points, and their weights.
 
         Returns:
@@ -269,7 +271,9 @@ class _BilateralFilter:
         weights /= weights.sum(axis=1, keepdims=True)
         return texel_index, weights
 
-    def weigh_neighbors(self, points: _SurfacePoints) -> tuple[IntArray, Float64Array]:
+    def weigh_neighbors(
+        self, points: _SurfacePoints
+    ) -> tuple[assets.IntArray, assets.Float64Array]:
         """Return the texels around points, and their weights.
 
         Returns:
@@ -291,7 +295,7 @@ class _BilateralFilter:
             weights.append(self._weigh(points, row, column, texel))
         return np.stack(neighbors, axis=1), np.stack(weights, axis=1)
 
-    def _number_texels(self) -> IntArray:
+    def _number_texels(self) -> assets.IntArray:
         """Return the index of the texel in each cell of the grid; -1 outside of charts.
 
         Texels are the covered cells, numbered row by row.
@@ -301,8 +305,12 @@ class _BilateralFilter:
         return np.where(is_covered, texel_at, -1)
 
     def _weigh(
-        self, points: _SurfacePoints, row: IntArray, column: IntArray, texel: IntArray
-    ) -> Float64Array:
+        self,
+        points: _SurfacePoints,
+        row: assets.IntArray,
+        column: assets.IntArray,
+        texel: assets.IntArray,
+    ) -> assets.Float64Array:
         """Return the weights (N,) of the neighbors of points at rows and columns.
 
         A neighbor outside of the charts has the index -1, and gets the weight 0.
@@ -322,7 +330,10 @@ class _BilateralFilter:
         return np.where(is_used, weight, 0.0)
 
     def use_nearest_texel(
-        self, points: _SurfacePoints, texel_index: IntArray, weights: Float64Array
+        self,
+        points: _SurfacePoints,
+        texel_index: assets.IntArray,
+        weights: assets.Float64Array,
     ) -> None:
         """Give all the weight to the nearest texel if no neighbor of a point has any.
 
@@ -345,11 +356,11 @@ class _BilateralFilter:
 
 def make_lookup_matrix(
     texels: LitTexels,
-    charts: Charts,
+    charts: prediction.Charts,
     shape: tuple[int, int],
-    vertices: Float32Array,
-    normals: Float32Array,
-    buried: BoolArray,
+    vertices: assets.Float32Array,
+    normals: assets.Float32Array,
+    buried: assets.BoolArray,
 ) -> Tensor:
     """Return the matrix that smooths light and looks it up in a finer grid.
 
@@ -370,10 +381,10 @@ def make_lookup_matrix(
     if buried.all():
         # With no texel left there would be no light at all: so all of them count.
         buried = np.zeros_like(buried)
-    fine_charts = rasterize_charts(charts.mesh, shape)
+    fine_charts = prediction.rasterize_charts(charts.mesh, shape)
     # Cells up to `BORDER_TEXELS` outside of a chart count too: interpolation at the
     # chart's border reads them.
-    is_near_chart = fine_charts.texels_to_covered <= BORDER_TEXELS
+    is_near_chart = fine_charts.texels_to_covered <= prediction.BORDER_TEXELS
     points = _find_cell_points(fine_charts, is_near_chart, vertices, normals, charts)
     texel_width = _compute_texel_width(charts, vertices)
     bilateral_filter = _BilateralFilter(texels, charts, texel_width, buried)
@@ -384,11 +395,11 @@ def make_lookup_matrix(
 
 
 def _find_cell_points(
-    fine_charts: Charts,
-    is_selected: BoolArray,
-    vertices: Float32Array,
-    normals: Float32Array,
-    charts: Charts,
+    fine_charts: prediction.Charts,
+    is_selected: assets.BoolArray,
+    vertices: assets.Float32Array,
+    normals: assets.Float32Array,
+    charts: prediction.Charts,
 ) -> _SurfacePoints:
     """Return the surface points of cells of a finer grid.
 
@@ -411,9 +422,9 @@ def _find_cell_points(
 
 
 def _make_sparse(
-    fine_cell: IntArray,
-    texel_index: IntArray,
-    weights: Float64Array,
+    fine_cell: assets.IntArray,
+    texel_index: assets.IntArray,
+    weights: assets.Float64Array,
     size: tuple[int, int],
 ) -> Tensor:
     """Return a sparse matrix of weights, without those of 0.001 and less.
@@ -429,10 +440,12 @@ def _make_sparse(
     is_entry = weights > 1e-3
     cell = np.broadcast_to(fine_cell[:, None], texel_index.shape)[is_entry]
     entries = (weights[is_entry].astype(np.float32), (cell, texel_index[is_entry]))
-    return to_torch_csr(scipy.sparse.coo_matrix(entries, size).tocsr())
+    return prediction.to_torch_csr(scipy.sparse.coo_matrix(entries, size).tocsr())
 
 
-def _compute_texel_width(charts: Charts, vertices: Float32Array) -> float:
+def _compute_texel_width(
+    charts: prediction.Charts, vertices: assets.Float32Array
+) -> float:
     """Return the mean width of a texel in world space.
 
     `vertices` are (V, 3) in world space, while the charts' areas are in the mesh's own
@@ -445,8 +458,8 @@ def _compute_texel_width(charts: Charts, vertices: Float32Array) -> float:
 
 
 def _iter_neighbourhood(
-    y: Float64Array, x: Float64Array
-) -> Iterator[tuple[IntArray, IntArray]]:
+    y: assets.Float64Array, x: assets.Float64Array
+) -> Iterator[tuple[assets.IntArray, assets.IntArray]]:
     """Yield rows and columns (N,) of the neighbours of positions in a grid.
 
     A position's neighbours are the texels up to `FILTER_REACH` from the texel nearest
@@ -463,7 +476,7 @@ def _iter_neighbourhood(
             yield nearest_row + row_offset, nearest_column + column_offset
 
 
-def make_smoothing_matrix(ground: LitTexels, sees_sky: BoolArray) -> Tensor:
+def make_smoothing_matrix(ground: LitTexels, sees_sky: assets.BoolArray) -> Tensor:
     """Return the matrix that smooths the light of a ground, by 5 x 5 binomial weights.
 
     A texel that sees nothing of the sky lies under something, and is dark. It does not
@@ -485,10 +498,10 @@ def make_smoothing_matrix(ground: LitTexels, sees_sky: BoolArray) -> Tensor:
     weights = _make_binomial_weights(is_used)
     # The row of a texel that is not used is that of the nearest one that is.
     rows = weights.astype(np.float32)[nearest_used]
-    return to_torch_csr(rows)
+    return prediction.to_torch_csr(rows)
 
 
-def _make_binomial_weights(is_used: BoolArray) -> scipy.sparse.csr_array:
+def _make_binomial_weights(is_used: assets.BoolArray) -> scipy.sparse.csr_array:
     """Return the weights (n, n) of used texels (w, w) for each texel.
 
     Rows sum to 1, or to 0 if no texel nearby is used.
@@ -511,8 +524,10 @@ def _make_binomial_weights(is_used: BoolArray) -> scipy.sparse.csr_array:
 
 
 def _interpolate(
-    charts: Charts, vertices: Float32Array, normals: Float32Array
-) -> tuple[Float32Array, Float32Array]:
+    charts: prediction.Charts,
+    vertices: assets.Float32Array,
+    normals: assets.Float32Array,
+) -> tuple[assets.Float32Array, assets.Float32Array]:
     """Return the position and the unit normal (h, w, 3) of the surface in each cell.
 
     Args:
@@ -528,7 +543,7 @@ def _interpolate(
     return position.astype(np.float32), unit_normal.astype(np.float32)
 
 
-def _find_nearest(covered: BoolArray) -> IntArray:
+def _find_nearest(covered: assets.BoolArray) -> assets.IntArray:
     """Return for each cell (h * w,) the flat index of the nearest covered cell.
 
     A covered cell is its own nearest.
@@ -539,7 +554,7 @@ def _find_nearest(covered: BoolArray) -> IntArray:
     rows, columns = ndimage.distance_transform_edt(
         ~covered, return_distances=False, return_indices=True
     )
-    nearest: IntArray = (rows * covered.shape[1] + columns).ravel()
+    nearest: assets.IntArray = (rows * covered.shape[1] + columns).ravel()
     return nearest
 
 
@@ -821,7 +836,7 @@ def compute_irradiance(
 
 
 def make_view_matrices(
-    met_cells: npt.NDArray[np.int32], texel_of_cell: IntArray, n_texels: int
+    met_cells: npt.NDArray[np.int32], texel_of_cell: assets.IntArray, n_texels: int
 ) -> tuple[Tensor, Tensor]:
     """Return the matrices from radiance to irradiance, by what the rays of texels met.
 
@@ -847,7 +862,7 @@ def make_view_matrices(
 
 
 def _make_ray_matrix(
-    is_entry: BoolArray, column: npt.NDArray[np.integer[Any]], n_columns: int
+    is_entry: assets.BoolArray, column: npt.NDArray[np.integer[Any]], n_columns: int
 ) -> Tensor:
     """Return a sparse matrix (n, columns) in which selected rays count pi / n_rays.
 
@@ -861,7 +876,7 @@ def _make_ray_matrix(
     values = np.full(len(column), math.pi / n_rays, dtype=np.float32)
     entries = (values, (row[is_entry.ravel()], column))
     size = (n_texels, n_columns)
-    return to_torch_csr(scipy.sparse.coo_matrix(entries, size).tocsr())
+    return prediction.to_torch_csr(scipy.sparse.coo_matrix(entries, size).tocsr())
 
 
 def look_up_environment(padded: Tensor, directions: Tensor) -> Tensor:

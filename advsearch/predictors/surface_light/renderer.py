@@ -20,19 +20,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from advsearch.scene.description import OBJECT
-from advsearch.scene.mitsuba_backend.surface import RAYS_PER_PIXEL, ViewSamples
-from advsearch.scene.predictor import (
-    MAX_BYTES,
-    NOISE,
-    PROBE_FRACTIONS,
-    Predictor,
-    Refusal,
-    RefusalCause,
-    inputs_differ,
-)
-from advsearch.scene.renderer import Renderer
-from advsearch.scene.surface.arrangement import (
+from advsearch.extend import prediction, stored_files
+from advsearch.predictors.surface_light.arrangement import (
     CAMERA_INPUTS,
     COLOR_INPUT,
     ENVIRONMENT_INPUT,
@@ -41,7 +30,7 @@ from advsearch.scene.surface.arrangement import (
     ArrangementLight,
     SurfaceView,
 )
-from advsearch.trust.stored_files import scale_limit
+from advsearch.predictors.surface_light.view_rays import RAYS_PER_PIXEL, ViewSamples
 
 MAX_RAYS = 1 << 21  # rays of cameras of one launch
 N_COMPARED_TEXELS = 333  # texels of a map that are compared with those of other maps
@@ -87,7 +76,7 @@ class MapFingerprint:
         return torch.where(self.mean > 0.0, other.mean / self.mean, 1.0)
 
 
-class SurfaceRenderer(Predictor):
+class SurfaceRenderer(prediction.Predictor):
     """Predict images by light on surfaces, in spaces that `find_refusal` accepts.
 
     An image is linear in the base color of the object. Light between the object and
@@ -111,7 +100,7 @@ class SurfaceRenderer(Predictor):
     fixed_light: ArrangementLight | None = None
     n_traced_images = 0
 
-    def __init__(self, traced: Renderer, u: Tensor, seed: int) -> None:
+    def __init__(self, traced: prediction.Renderer, u: Tensor, seed: int) -> None:
         """Lay texels over the scene as it is at one configuration.
 
         Predictions hold as long as only cameras, environment and base color change.
@@ -159,7 +148,8 @@ class SurfaceRenderer(Predictor):
         fixed_inputs = _drop_free_inputs(inputs)
         fixed_inputs[COLOR_INPUT] = self.get_color(inputs)
         return expected.keys() == fixed_inputs.keys() and not any(
-            inputs_differ(expected[name], fixed_inputs[name]) for name in expected
+            prediction.inputs_differ(expected[name], fixed_inputs[name])
+            for name in expected
         )
 
     def update_base_color(self, u: Tensor) -> None:
@@ -230,7 +220,9 @@ class SurfaceRenderer(Predictor):
     def _drop_old_lights(self) -> None:
         """Drop the oldest lights over the limit of memory; the newest stays in any case."""
         # `self.n_bytes` includes the stored lights.
-        while len(self.stored_lights) > 1 and self.n_bytes > scale_limit(MAX_BYTES):
+        while len(self.stored_lights) > 1 and self.n_bytes > stored_files.scale_limit(
+            prediction.MAX_BYTES
+        ):
             oldest = next(iter(self.stored_lights))
             self.stored_lights.pop(oldest)
             self.n_dropped += 1
@@ -377,7 +369,9 @@ def _drop_free_inputs(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name: inputs[name] for name in inputs if name not in FREE_INPUTS}
 
 
-def find_refusal(renderer: Renderer, varying: Collection[str]) -> Refusal | None:
+def find_refusal(
+    renderer: prediction.Renderer, varying: Collection[str]
+) -> prediction.Refusal | None:
     """Return why light on surfaces cannot predict a space's images; None if it can.
 
     How good a prediction is does not count here: that is measured afterwards.
@@ -394,89 +388,58 @@ def find_refusal(renderer: Renderer, varying: Collection[str]) -> Refusal | None
     refusal = _find_searched_group_refusal(renderer, varying)
     if refusal is not None:
         return refusal
-    changed = find_changed_inputs(renderer, varying)
+    changed = prediction.find_changed_inputs(renderer, varying)
     # A change of anything else moves or repaints surfaces, so that the stored light
     # would no longer hold.
     if not changed <= FREE_INPUTS:
-        return Refusal(
+        return prediction.Refusal(
             f"{', '.join(sorted(changed - FREE_INPUTS))} varies, and light on "
             "surfaces is stored for one arrangement"
         )
     if not changed & CAMERA_INPUTS:
-        return Refusal("no camera varies", RefusalCause.NO_CAMERA)
+        return prediction.Refusal("no camera varies", prediction.RefusalCause.NO_CAMERA)
     return None
 
 
 def _find_searched_group_refusal(
-    renderer: Renderer, varying: Collection[str]
-) -> Refusal | None:
+    renderer: prediction.Renderer, varying: Collection[str]
+) -> prediction.Refusal | None:
     """Return why a searched group, which does not vary, is refused; None if none is."""
     for group in renderer.plan.groups:
         # A group with the estimator "image" changes only the finished image.
         if group.control in varying or group.estimator == "image":
             continue
         if renderer.inputs_by_group.get(group.name, frozenset()) != {COLOR_INPUT}:
-            return Refusal(f"{group.name} changes more than the object's base color")
+            return prediction.Refusal(
+                f"{group.name} changes more than the object's base color"
+            )
     return None
 
 
-def find_scene_refusal(renderer: Renderer) -> Refusal | None:
+def find_scene_refusal(renderer: prediction.Renderer) -> prediction.Refusal | None:
     """Return why light cannot be stored on a scene's surfaces; None if it may be.
 
     It can be if the scene is an object with one texture on a ground, under an
     environment, and if images are denoised: predictions have no noise.
     """
     description = renderer.scene.description_and_filter[0]
-    mesh_part = description.meshes[OBJECT]
+    mesh_part = description.meshes[prediction.OBJECT]
     has_mitsuba_surface = mesh_part.surface is not None
     if mesh_part.mesh.repeats or has_mitsuba_surface:
-        return Refusal(
+        return prediction.Refusal(
             "the object's surface repeats its texture, or is one of Mitsuba's own"
         )
     has_more_light_or_parts = len(description.parts) > 0 or description.has_emission
     if description.environment is None or has_more_light_or_parts:
-        return Refusal(
+        return prediction.Refusal(
             "there is more in the scene than the object, its ground and an environment"
         )
     if renderer.scene.is_volumetric or description.thin_lens or description.backdrop:
-        return Refusal("there is haze, a lens with an aperture, or a plain background")
-    if description.get_number("camera.drops") > 0.0:
-        return Refusal("there are raindrops before the camera")
-    if renderer.formation.denoiser != "oidn":
-        return NOISE
-    return None
-
-
-def find_changed_inputs(renderer: Renderer, varying: Collection[str]) -> frozenset[str]:
-    """Return the names of the scene inputs that some controls change.
-
-    All coordinates of these controls are set to one value, one of a few fractions of
-    their range after another, and the inputs are compared with those of the start.
-
-    Args:
-        renderer: renderer of the scene.
-        varying: names of controls, or of groups of coordinates such as "pose.yaw".
-    """
-    changed: set[str] = set()
-    with torch.no_grad():
-        start_inputs = renderer.scene.input_assembler(
-            renderer.space.inputs(renderer.start)
+        return prediction.Refusal(
+            "there is haze, a lens with an aperture, or a plain background"
         )
-        for fraction in PROBE_FRACTIONS:
-            u = _set_varying_to_fraction(renderer, varying, fraction)
-            inputs = renderer.scene.input_assembler(renderer.space.inputs(u))
-            for name in start_inputs.keys() | inputs.keys():
-                if inputs_differ(start_inputs.get(name), inputs.get(name)):
-                    changed.add(name)
-    return frozenset(changed)
-
-
-def _set_varying_to_fraction(
-    renderer: Renderer, varying: Collection[str], fraction: float
-) -> Tensor:
-    """Return the start (d,) with the coordinates of some controls at a fraction."""
-    u = renderer.start.clone()
-    for group in renderer.space.groups:
-        if group.control in varying or group.name in varying:
-            u[group.coordinates] = fraction
-    return u
+    if description.get_number("camera.drops") > 0.0:
+        return prediction.Refusal("there are raindrops before the camera")
+    if renderer.formation.denoiser != "oidn":
+        return prediction.NOISE
+    return None

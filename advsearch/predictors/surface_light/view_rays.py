@@ -17,11 +17,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from advsearch.scene.assets import Float32Array
-from advsearch.scene.camera_model import CameraModel
-from advsearch.scene.mitsuba_backend import texel_rays
-from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.mitsuba_backend.variant import Recordings, dr, mi, mitsuba_lock
+from advsearch.extend import assets, prediction
+from advsearch.predictors.surface_light import texel_rays
+
+dr = prediction.dr
+mi = prediction.mi
 
 # Spreads of gloss, radians. Up to the first one a single ray finds the reflection of
 # the ground; from the second one on it is taken from the blurred map.
@@ -135,13 +135,13 @@ class ViewTracer:
 
     def __init__(
         self,
-        scene: MitsubaScene,
+        scene: prediction.MitsubaScene,
         grids: Sequence[texel_rays.TexelGrid],
         lobes: Sequence[texel_rays.Lobes],
         widths: Sequence[float],
         photograph_height: float | None,
-        model: CameraModel | None,
-        center: Float32Array,
+        model: prediction.CameraModel | None,
+        center: assets.Float32Array,
     ) -> None:
         """Prepare the tables of all surfaces and of the lens for the kernel.
 
@@ -161,9 +161,9 @@ class ViewTracer:
         self._center = center.tolist()
         self._lobe_tables = _join_lobe_tables(lobes)
         self._lens = None if model is None else self._make_lens_table(model)
-        self._recordings = Recordings()
+        self._recordings = prediction.Recordings()
 
-    def _make_lens_table(self, model: CameraModel) -> Float32Array:
+    def _make_lens_table(self, model: prediction.CameraModel) -> assets.Float32Array:
         """Return the lens's rays through each pixel, flat, four numbers each.
 
         The first three are the direction in the camera's axes; the fourth is above 0
@@ -181,7 +181,7 @@ class ViewTracer:
         x = (column.ravel() + x_offset) / width
         y = (row.ravel() + y_offset) / height
         positions = torch.from_numpy(np.stack([x, y], axis=1))
-        table: Float32Array = model.make_ray_table(positions).numpy().ravel()
+        table: assets.Float32Array = model.make_ray_table(positions).numpy().ravel()
         return table
 
     def __call__(
@@ -198,7 +198,7 @@ class ViewTracer:
             A function that waits for the result and returns it; until it is called the
             processor may do other things.
         """
-        with mitsuba_lock:
+        with prediction.mitsuba_lock:
             height, width = self._scene.resolution
             count = len(cameras)
             camera_numbers = _join_camera_numbers(cameras, height, width)
@@ -675,7 +675,7 @@ class ViewTracer:
         return _GridPosition(first_cell, n_rows, n_columns, y, x, on_any_grid)
 
 
-def _join_lobe_tables(lobes: Sequence[texel_rays.Lobes]) -> Float32Array:
+def _join_lobe_tables(lobes: Sequence[texel_rays.Lobes]) -> assets.Float32Array:
     """Return the tables of all surfaces, flat: the six of the first, then the next.
 
     The tables of a surface are in the order of `LOBE_TABLES`.
@@ -811,7 +811,7 @@ def _turn_to_viewer(normal: Any, direction: Any) -> Any:
 
 def _join_camera_numbers(
     cameras: Sequence[Mapping[str, Tensor]], height: int, width: int
-) -> Float32Array:
+) -> assets.Float32Array:
     """Return the `CAMERA_SIZE` numbers of all cameras, one after the other, flat.
 
     Args:
@@ -824,7 +824,7 @@ def _join_camera_numbers(
 
 def _make_camera_numbers(
     inputs: Mapping[str, Tensor], height: int, width: int
-) -> Float32Array:
+) -> assets.Float32Array:
     """Return the `CAMERA_SIZE` numbers of a camera as the kernel takes them.
 
     They are its axes to the left, up and forward (9 numbers), its position (3), half
@@ -865,7 +865,7 @@ def _fetch(channels: Sequence[Any], size: tuple[int, int, int]) -> ViewSamples:
             weight is that of a back.
         size: number of cameras, rows and columns.
     """
-    with mitsuba_lock:
+    with prediction.mitsuba_lock:
         # The first channels are three of radiance, and the coverage.
         radiance = np.stack([channel.numpy() for channel in channels[:3]], axis=-1)
         # A copy, since `numpy` may return memory that belongs to Dr.Jit.
@@ -885,7 +885,7 @@ def _fetch(channels: Sequence[Any], size: tuple[int, int, int]) -> ViewSamples:
         )
 
 
-def _stack_layers(channels: Sequence[Any]) -> list[Float32Array]:
+def _stack_layers(channels: Sequence[Any]) -> list[assets.Float32Array]:
     """Return u, v and weight of all rays and layers, each (rays x layers,).
 
     The channels are u, v and weight of the first layer, then those of the next one. In

@@ -25,18 +25,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from advsearch.scene.assembly import IMAGE_INPUTS
-from advsearch.scene.assets import BoolArray, Float32Array, IntArray
-from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.description import OBJECT
-from advsearch.scene.mitsuba_backend.surface import (
-    RAYS_PER_PIXEL,
-    LightMaps,
-    ViewSamples,
-    ViewTracer,
-    make_light_maps,
-)
-from advsearch.scene.mitsuba_backend.texel_rays import (
+from advsearch.extend import assets, color, prediction
+from advsearch.predictors.surface_light import texels
+from advsearch.predictors.surface_light.texel_rays import (
     Ints,
     Lobes,
     compute_visible_cosines,
@@ -45,14 +36,13 @@ from advsearch.scene.mitsuba_backend.texel_rays import (
     measure_lobes,
     trace_texel_rays,
 )
-from advsearch.scene.photographed_ground import (
-    compute_irradiance as compute_open_sky_irradiance,
+from advsearch.predictors.surface_light.view_rays import (
+    RAYS_PER_PIXEL,
+    LightMaps,
+    ViewSamples,
+    ViewTracer,
+    make_light_maps,
 )
-from advsearch.scene.predictor import LinearMap
-from advsearch.scene.raster import Charts, rasterize_charts
-from advsearch.scene.renderer import Renderer
-from advsearch.scene.surface import texels
-from advsearch.scene.transport.matrix import find_bilinear_weights
 
 
 class SurfaceView:
@@ -141,7 +131,7 @@ def _find_camera_samples(
 
 def _find_cell_weights(
     samples: ViewSamples, selected: slice, shape: tuple[int, int]
-) -> tuple[Ints, Float32Array]:
+) -> tuple[Ints, assets.Float32Array]:
     """Return the four cells of the fine grid that each sample reads, and their weights.
 
     Both are (n, 4). The cells of the back follow those of the front.
@@ -151,7 +141,9 @@ def _find_cell_weights(
         selected: the n samples of one camera.
         shape: rows and columns of the fine grid.
     """
-    cells, fractions = find_bilinear_weights(samples.uv[selected].numpy(), shape)
+    cells, fractions = prediction.find_bilinear_weights(
+        samples.uv[selected].numpy(), shape
+    )
     is_back = samples.is_back[selected].numpy()
     cells += np.int32(shape[0] * shape[1]) * is_back[:, None]
     return cells, fractions * samples.diffuse_weight[selected].numpy()[:, None]
@@ -169,7 +161,7 @@ def multiply_sparse(matrix: scipy.sparse.csr_matrix, columns: Tensor) -> Tensor:
 
     times = partial(multiply, matrix)
     transposed_times = partial(multiply, matrix.T)
-    rows: Tensor = LinearMap.apply(times, transposed_times, columns)  # type: ignore[no-untyped-call]
+    rows: Tensor = prediction.LinearMap.apply(times, transposed_times, columns)  # type: ignore[no-untyped-call]
     return rows
 
 
@@ -187,7 +179,7 @@ With the camera's and the sky's segments that makes a path of `MAX_DEPTH`.
 MIN_FINE_SIZE = 192
 # largest reflectance of a photographed ground for light between surfaces
 MAX_GROUND_REFLECTANCE = 0.95
-COLOR_INPUT = f"{OBJECT}.base_color"
+COLOR_INPUT = f"{prediction.OBJECT}.base_color"
 ENVIRONMENT_INPUT = "environment.padded"
 GROUND_NAME = "ground"
 CAMERA_INPUTS = frozenset(
@@ -195,7 +187,7 @@ CAMERA_INPUTS = frozenset(
 )
 FREE_INPUTS = (
     CAMERA_INPUTS
-    | IMAGE_INPUTS
+    | prediction.IMAGE_INPUTS
     | {ENVIRONMENT_INPUT, COLOR_INPUT, "ground.reflectance"}
 )
 """Scene inputs that may change without tracing the rays of texels again.
@@ -248,7 +240,7 @@ class Arrangement:
 
     def __init__(
         self,
-        renderer: Renderer,
+        renderer: prediction.Renderer,
         inputs: Mapping[str, Tensor],
         texture_shape: tuple[int, int],
         seed: int,
@@ -264,7 +256,7 @@ class Arrangement:
         """
         self._scene = renderer.scene
         self.inputs = {
-            name: inputs[name] for name in inputs if name not in IMAGE_INPUTS
+            name: inputs[name] for name in inputs if name not in prediction.IMAGE_INPUTS
         }
         self._scene.set_inputs(self.inputs)
         description = self._scene.description_and_filter[0]
@@ -291,7 +283,7 @@ class Arrangement:
         object_lobes = [self._measure_object_lobes()] * self.n_sides
         return object_lobes + [Lobes.make_diffuse()] * n_grounds
 
-    def _lay_texels(self, seed: int) -> Float32Array:
+    def _lay_texels(self, seed: int) -> assets.Float32Array:
         """Lay texels over all surfaces, and find what they see of sky and each other.
 
         Returns:
@@ -299,11 +291,13 @@ class Arrangement:
         """
         vertices = self._get_object_buffer("vertices")
         normals = self._get_object_buffer("normals")
-        object_center: Float32Array = 0.5 * (
+        object_center: assets.Float32Array = 0.5 * (
             vertices.min(axis=0) + vertices.max(axis=0)
         )
-        object_mesh = self._scene.description_and_filter[0].meshes[OBJECT].mesh
-        charts = rasterize_charts(object_mesh, OBJECT_TEXELS)
+        object_mesh = (
+            self._scene.description_and_filter[0].meshes[prediction.OBJECT].mesh
+        )
+        charts = prediction.rasterize_charts(object_mesh, OBJECT_TEXELS)
         surfaces = self._make_object_texels(charts, vertices, normals)
         self.n_sides = len(surfaces)
         # The ground comes after the sides of the object, so that its index among the
@@ -325,9 +319,9 @@ class Arrangement:
     def _make_lookup_matrices(
         self,
         surfaces: Sequence[texels.LitTexels],
-        charts: Charts,
-        vertices: Float32Array,
-        normals: Float32Array,
+        charts: prediction.Charts,
+        vertices: assets.Float32Array,
+        normals: assets.Float32Array,
         met_cells: Ints,
     ) -> list[Tensor]:
         """Return for each side of the object a matrix from texels to the fine grid.
@@ -352,7 +346,9 @@ class Arrangement:
             for side in range(self.n_sides)
         ]
 
-    def _make_ground_texels(self, object_center: Float32Array) -> texels.LitTexels:
+    def _make_ground_texels(
+        self, object_center: assets.Float32Array
+    ) -> texels.LitTexels:
         """Return the texels of the ground, which goes on from below the object (3,)."""
         is_photographed = self._scene.description_and_filter[0].photograph is not None
         reach = self._compute_ground_reach(is_photographed)
@@ -371,7 +367,7 @@ class Arrangement:
             seed=seed,
         )
 
-    def _make_view_tracer(self, object_center: Float32Array) -> ViewTracer:
+    def _make_view_tracer(self, object_center: assets.Float32Array) -> ViewTracer:
         """Return the tracer of camera rays, with the lens that the inputs set.
 
         Args:
@@ -394,7 +390,7 @@ class Arrangement:
         """Return the texels of the ground; it follows the sides of the object."""
         return self.texels.select_grid(self.n_sides)
 
-    def _is_sky(self, cells: Ints) -> BoolArray:
+    def _is_sky(self, cells: Ints) -> assets.BoolArray:
         """Return which of the cells that rays met are the sky's.
 
         The cells of the sky are numbered after those of all surfaces.
@@ -414,22 +410,25 @@ class Arrangement:
         sees_sky = self._is_sky(met_cells[self._select_ground()]).any(axis=1)
         return texels.make_smoothing_matrix(ground, np.asarray(sees_sky))
 
-    def _get_object_buffer(self, buffer: str) -> Float32Array:
+    def _get_object_buffer(self, buffer: str) -> assets.Float32Array:
         """Return the object's "vertices" or "normals" (V, 3).
 
         They are those of the inputs, or else of the scene as it was loaded.
         """
-        name = f"{OBJECT}.{buffer}"
+        name = f"{prediction.OBJECT}.{buffer}"
         values = (
             self.inputs[name]
             if name in self.inputs
             else self._scene.get_base_value(name)
         )
-        rows: Float32Array = values.reshape(-1, 3).numpy()
+        rows: assets.Float32Array = values.reshape(-1, 3).numpy()
         return rows
 
     def _make_object_texels(
-        self, charts: Charts, vertices: Float32Array, normals: Float32Array
+        self,
+        charts: prediction.Charts,
+        vertices: assets.Float32Array,
+        normals: assets.Float32Array,
     ) -> list[texels.LitTexels]:
         """Return the texels of the object, as one surface.
 
@@ -443,11 +442,17 @@ class Arrangement:
         """
         # The side of a grid says which hits it has: 0 those on both sides of the faces,
         # 1 those on the front, -1 those on the back.
-        shared = texels.make_mesh_texels(OBJECT, charts, vertices, normals, side=0)
-        if not is_visible_from_behind(self._scene, OBJECT, shared.positions):
+        shared = texels.make_mesh_texels(
+            prediction.OBJECT, charts, vertices, normals, side=0
+        )
+        if not is_visible_from_behind(self._scene, prediction.OBJECT, shared.positions):
             return [shared]
-        front = texels.make_mesh_texels(OBJECT, charts, vertices, normals, side=1)
-        back = texels.make_mesh_texels(OBJECT, charts, vertices, -normals, side=-1)
+        front = texels.make_mesh_texels(
+            prediction.OBJECT, charts, vertices, normals, side=1
+        )
+        back = texels.make_mesh_texels(
+            prediction.OBJECT, charts, vertices, -normals, side=-1
+        )
         return [front, back]
 
     def _compute_ground_reach(self, is_photographed: bool) -> float:
@@ -456,7 +461,7 @@ class Arrangement:
             return math.inf
         return self._scene.description_and_filter[0].get_number("ground.size") / 2.0
 
-    def _find_buried(self, met_cells: Ints, side: int) -> BoolArray:
+    def _find_buried(self, met_cells: Ints, side: int) -> assets.BoolArray:
         """Return which texels (n,) of one side of the object lie inside something.
 
         A ray inside of something meets the back of a face. A texel is buried if more
@@ -501,13 +506,15 @@ class Arrangement:
             self.texels.normals[texel],
         )
 
-    def _find_opaque_texels(self, front: slice) -> IntArray:
+    def _find_opaque_texels(self, front: slice) -> assets.IntArray:
         """Return the texels of the object's front with the largest opacity.
 
         Without an opacity map these are all. The front is the first grid, so that its
         texels and cells are numbered from 0.
         """
-        opacity = self._scene.description_and_filter[0].meshes[OBJECT].opacity
+        opacity = (
+            self._scene.description_and_filter[0].meshes[prediction.OBJECT].opacity
+        )
         candidates = np.arange(front.start, front.stop)
         if opacity is None:
             return candidates
@@ -516,10 +523,12 @@ class Arrangement:
         opacity_row = row * opacity.shape[0] // n_rows
         opacity_column = column * opacity.shape[1] // n_columns
         texel_opacity = opacity[opacity_row, opacity_column]
-        opaque_texels: IntArray = candidates[texel_opacity >= texel_opacity.max()]
+        opaque_texels: assets.IntArray = candidates[
+            texel_opacity >= texel_opacity.max()
+        ]
         return opaque_texels
 
-    def _find_ground_below(self, center: Float32Array) -> tuple[Tensor, Tensor]:
+    def _find_ground_below(self, center: assets.Float32Array) -> tuple[Tensor, Tensor]:
         """Find where the blurred maps, seen from the object's center, show the ground.
 
         A photographed ground takes its color from the environment's map. The color of a
@@ -693,7 +702,9 @@ class Arrangement:
         is_plain = self._capture_height is None
         if is_plain:
             return self._smooth @ leaving_radiance[ground]
-        open_irradiance = compute_open_sky_irradiance(padded[:, 1:-1]).clamp_min(1e-12)
+        open_irradiance = prediction.compute_open_sky_irradiance(
+            padded[:, 1:-1]
+        ).clamp_min(1e-12)
         return self._smooth @ (irradiance[ground] / open_irradiance)
 
     def _compute_far_ground(self, visible_ground: Tensor) -> Tensor:
@@ -779,12 +790,14 @@ class Arrangement:
         ground_points = self.texels.positions[self._select_ground()]
         if self._capture_height is None:  # a plain ground
             srgb = torch.tensor(self._scene.description_and_filter[0].ground_color)
-            return srgb_to_linear(srgb).expand(len(ground_points), 3)
+            return color.srgb_to_linear(srgb).expand(len(ground_points), 3)
         capture_position = torch.tensor([0.0, 0.0, self._capture_height])
         world_directions = torch.from_numpy(ground_points) - capture_position
         map_directions = world_directions @ self.world_to_map.T
         photograph = texels.look_up_environment(padded, map_directions)
-        open_irradiance = compute_open_sky_irradiance(padded[:, 1:-1]).clamp_min(1e-12)
+        open_irradiance = prediction.compute_open_sky_irradiance(
+            padded[:, 1:-1]
+        ).clamp_min(1e-12)
         return (photograph * math.pi / open_irradiance).clamp_max(
             MAX_GROUND_REFLECTANCE
         )
@@ -816,14 +829,16 @@ def _make_upsampling_matrix(
         texture: rows and columns of the texture.
         fine: rows and columns of the fine grid.
     """
-    texel, fractions = find_bilinear_weights(_compute_cell_centers(fine), texture)
+    texel, fractions = prediction.find_bilinear_weights(
+        _compute_cell_centers(fine), texture
+    )
     n_fine = fine[0] * fine[1]
     row_starts = np.arange(n_fine + 1, dtype=np.int32) * 4
     entries = (fractions.ravel(), texel.ravel(), row_starts)
     return scipy.sparse.csr_matrix(entries, (n_fine, texture[0] * texture[1]))
 
 
-def _compute_cell_centers(shape: tuple[int, int]) -> Float32Array:
+def _compute_cell_centers(shape: tuple[int, int]) -> assets.Float32Array:
     """Return the centers (cells, 2) of a grid's cells, as columns and rows in [0, 1]."""
     n_rows, n_columns = shape
     y, x = np.meshgrid(

@@ -16,31 +16,19 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from advsearch import seeds
-from advsearch.attacks import Evaluate, Evaluation, Policy
-from advsearch.attacks.evaluation import Query
-from advsearch.controls import Space
-from advsearch.engine.acceptance import N_VIEWS, ComparedView, Deviation
-from advsearch.engine.bank import sample_condition
-from advsearch.engine.problem import Problem
-from advsearch.engine.transport import PredictedSearch
-from advsearch.runs.results import BankOfConditions
-from advsearch.scene.color import round_to_8_bit
-from advsearch.scene.gradients import Group
-from advsearch.scene.mitsuba_backend.surface import RAYS_PER_PIXEL
-from advsearch.scene.predictor import Refusal, RefusalCause
-from advsearch.scene.surface import renderer as surface_renderer
-from advsearch.scene.surface.arrangement import (
+from advsearch.extend import Policy, Problem, color, prediction, results, seeds
+from advsearch.predictors.surface_light import renderer as surface_renderer
+from advsearch.predictors.surface_light.arrangement import (
     CAMERA_INPUTS,
     COLOR_INPUT,
     ENVIRONMENT_INPUT,
 )
-from advsearch.scene.surface.renderer import (
+from advsearch.predictors.surface_light.renderer import (
     LitCameraView,
     MapFingerprint,
     SurfaceRenderer,
 )
-from advsearch.scene.transport.matrix import ProgressCallback
+from advsearch.predictors.surface_light.view_rays import RAYS_PER_PIXEL
 
 MIN_IMAGES = 32
 """Smallest number of images of a search for which the light pays. The light and a
@@ -48,7 +36,7 @@ comparison take as long as about 25 rendered images, or 45 if the first views do
 decide.
 """
 # If no camera moves, light on surfaces has no advantage.
-NO_CAMERA = Refusal("no camera moves", RefusalCause.NO_CAMERA)
+NO_CAMERA = prediction.Refusal("no camera moves", prediction.RefusalCause.NO_CAMERA)
 # number of environments whose light is stored, if conditions change the environment
 N_LIGHTS = 64
 # first interval between two comparisons, as a number of evaluations
@@ -62,8 +50,8 @@ the cameras can be stored, and are traced only once for each set.
 
 
 def find_surface_light_refusal(
-    problem: Problem, steps: int, policy: Policy[Any], specialise: bool
-) -> Refusal | None:
+    problem: Problem, steps: int, policy: Policy[Any]
+) -> prediction.Refusal | None:
     """Return why light on surfaces does not predict a search; None if it may.
 
     Whether its predictions are accurate is measured later.
@@ -72,16 +60,9 @@ def find_surface_light_refusal(
         problem: problem of the search.
         steps: evaluations of the search.
         policy: policy by which it searches.
-        specialise: whether the search may leave out or predict anything at all (the
-            setting of this name).
     """
-    if not specialise:
-        return Refusal("nothing is left out")  # which the user has set
-    # why the image is composed of several; "" if it is not
-    if problem.renderer.composition_reason:
-        return Refusal(problem.renderer.composition_reason)
     names = [control.name for control in problem.space.controls]
-    changed_inputs = surface_renderer.find_changed_inputs(problem.renderer, names)
+    changed_inputs = prediction.find_changed_inputs(problem.renderer, names)
     moves_camera = bool(changed_inputs & CAMERA_INPUTS)
     if not moves_camera:
         return NO_CAMERA
@@ -94,32 +75,34 @@ def find_surface_light_refusal(
 
 def _find_search_refusal(
     problem: Problem, steps: int, policy: Policy[Any]
-) -> Refusal | None:
+) -> prediction.Refusal | None:
     """Return why a search is too short, or needs rendered images; None if it does not."""
     n_images = steps * problem.conditions_per_evaluation
     if n_images < MIN_IMAGES:
-        return Refusal(
+        return prediction.Refusal(
             f"light on surfaces pays from {MIN_IMAGES} pictures on",
-            RefusalCause.TOO_FEW_STEPS,
+            prediction.RefusalCause.TOO_FEW_STEPS,
         )
     if policy.takes_differences(problem.domain, steps):
-        return Refusal(f"{policy.name} takes derivatives that need rendered pictures")
+        return prediction.Refusal(
+            f"{policy.name} takes derivatives that need rendered pictures"
+        )
     return None
 
 
-def _find_forced_refusal(problem: Problem) -> Refusal | None:
+def _find_forced_refusal(problem: Problem) -> prediction.Refusal | None:
     """Return a refusal if the user forces an estimator of rendered images, else None."""
     for group in problem.gradient_plan.groups:
         # The user may force an estimator of derivatives of rendered images. Derivatives
         # of predicted images are computed in another way.
         needs_estimator = group.estimator not in ("none", "image")
         if group.is_forced and needs_estimator:
-            return Refusal(f"the estimator of {group.name} is forced")
+            return prediction.Refusal(f"the estimator of {group.name} is forced")
     return None
 
 
 @dataclass
-class SurfaceLight(PredictedSearch):
+class SurfaceLight(prediction.PredictedSearch):
     """The light on surfaces of a run whose searches have many cameras.
 
     The light of an environment on all surfaces is computed once and stored. Then images
@@ -178,7 +161,7 @@ class SurfaceLight(PredictedSearch):
         """Return the scene inputs that each control changes, by its name."""
         renderer = self.problem.renderer
         return {
-            control.name: surface_renderer.find_changed_inputs(renderer, [control.name])
+            control.name: prediction.find_changed_inputs(renderer, [control.name])
             for control in self.problem.space.controls
         }
 
@@ -197,7 +180,7 @@ class SurfaceLight(PredictedSearch):
         # the searched coordinates come first, those of the conditions after them
         return is_moving[:n_searched]
 
-    def _select_input_space(self) -> Space:
+    def _select_input_space(self) -> prediction.Space:
         """Return the space of the controls whose scene inputs have to be computed.
 
         Base colors are applied separately. So if nothing that is searched moves, these
@@ -243,7 +226,7 @@ class SurfaceLight(PredictedSearch):
                 needs_new_light[group.coordinates] = False
         return needs_new_light
 
-    def _only_scales_environment(self, group: Group) -> bool:
+    def _only_scales_environment(self, group: prediction.Group) -> bool:
         """Return whether a group only changes how bright the environment is.
 
         Two environment maps are computed, for two values of the coordinates of the
@@ -266,11 +249,11 @@ class SurfaceLight(PredictedSearch):
     def preparation_spp(self) -> int:
         return N_LIGHTS
 
-    def summarize_conditions(self) -> BankOfConditions | None:
+    def summarize_conditions(self) -> results.BankOfConditions | None:
         """Return the state of the bank of lights; None without conditions."""
         if self.problem.conditions is None:
             return None
-        return BankOfConditions(
+        return results.BankOfConditions(
             created=self._n_lights, dropped=self.renderer.n_dropped, grown=0, gap=None
         )
 
@@ -278,10 +261,10 @@ class SurfaceLight(PredictedSearch):
         return self.renderer.n_entries, self.renderer.n_bytes
 
     @property
-    def accuracy_refusal(self) -> Refusal | None:
+    def accuracy_refusal(self) -> prediction.Refusal | None:
         if not self.deviations or self.deviations[0].is_accepted:
             return None
-        return Refusal(f"light on surfaces is {self.deviations[0].reason}")
+        return prediction.Refusal(f"light on surfaces is {self.deviations[0].reason}")
 
     def count_predicted(self, kind: str, evaluations: int) -> int:
         """Return how many of the first evaluations of a search were predicted.
@@ -297,7 +280,7 @@ class SurfaceLight(PredictedSearch):
             return 0
         return super().count_predicted(kind, evaluations)
 
-    def prepare(self, tick: ProgressCallback = lambda samples: None) -> None:
+    def prepare(self, tick: prediction.ProgressCallback = lambda samples: None) -> None:
         """Compute the light under every condition of the bank, and check its accuracy.
 
         The first predicted images are compared with traced ones.
@@ -321,7 +304,7 @@ class SurfaceLight(PredictedSearch):
         self._compare(u, index=0)
 
     def _store_lights(
-        self, renderer: SurfaceRenderer, u: Tensor, tick: ProgressCallback
+        self, renderer: SurfaceRenderer, u: Tensor, tick: prediction.ProgressCallback
     ) -> None:
         """Compute and store the light of u (d,) under each condition of the bank."""
         for condition in self._bank_conditions:
@@ -345,7 +328,7 @@ class SurfaceLight(PredictedSearch):
         # If no coordinate of the conditions changes the light, one light serves all.
         n_conditions = N_LIGHTS if bool(self._needs_new_light.any()) else 1
         return [
-            sample_condition(problem.conditions, index, seed)
+            prediction.sample_condition(problem.conditions, index, seed)
             for index in range(n_conditions)
         ]
 
@@ -358,8 +341,8 @@ class SurfaceLight(PredictedSearch):
         return self._renderer
 
     def evaluate_all(
-        self, queries: Sequence[Query], trace: Evaluate
-    ) -> Iterator[Evaluation]:
+        self, queries: Sequence[prediction.Query], trace: prediction.Evaluate
+    ) -> Iterator[prediction.Evaluation]:
         """Evaluate queries of a search, or trials, in their order.
 
         If neither conditions nor colors vary, images do not depend on earlier
@@ -388,13 +371,13 @@ class SurfaceLight(PredictedSearch):
             yield self.evaluate(query, image)
 
     def _predict_batch(
-        self, batch: Sequence[Query], first_position: int
+        self, batch: Sequence[prediction.Query], first_position: int
     ) -> dict[int, Tensor]:
         """Return the predicted image (H, W, 3) of each query of a batch, by position."""
         images = self.renderer.predict_images([query.u for query in batch])
         return dict(enumerate(images, start=first_position))
 
-    def _must_trace(self, query: Query) -> bool:
+    def _must_trace(self, query: prediction.Query) -> bool:
         """Return whether a query has to be rendered.
 
         It has to if predictions were given up before it, or if its gradient takes
@@ -409,7 +392,9 @@ class SurfaceLight(PredictedSearch):
         is_predicted = query.row_index < n_predicted
         return not is_predicted
 
-    def evaluate(self, query: Query, image: Tensor | None = None) -> Evaluation:
+    def evaluate(
+        self, query: prediction.Query, image: Tensor | None = None
+    ) -> prediction.Evaluation:
         """Evaluate a query by predicted images.
 
         Args:
@@ -426,7 +411,9 @@ class SurfaceLight(PredictedSearch):
             return self._evaluate_image(query, image)
         return self._evaluate_over_conditions(query)
 
-    def _evaluate_trial(self, query: Query, image: Tensor | None) -> Evaluation:
+    def _evaluate_trial(
+        self, query: prediction.Query, image: Tensor | None
+    ) -> prediction.Evaluation:
         """Evaluate a trial, which tests a configuration outside of the search.
 
         The predicted image is rounded to 8 bits, as a file would hold it.
@@ -439,15 +426,17 @@ class SurfaceLight(PredictedSearch):
         with torch.no_grad():
             if image is None:
                 image = self.renderer(full_u)
-            rounded = round_to_8_bit(image)
-        return Evaluation.from_judgement(
+            rounded = color.round_to_8_bit(image)
+        return prediction.Evaluation.from_judgement(
             self.problem.judge(rounded, full_u),
             cost=0,  # nothing is rendered
             predicted=RAYS_PER_PIXEL,  # samples per pixel of a predicted image
             picture=rounded if query.includes_image else None,
         )
 
-    def _evaluate_image(self, query: Query, image: Tensor) -> Evaluation:
+    def _evaluate_image(
+        self, query: prediction.Query, image: Tensor
+    ) -> prediction.Evaluation:
         """Evaluate a query of a search by its predicted image, without derivative."""
         # There are no conditions here, so that the full configuration is u itself.
         evaluated, _ = self.problem.evaluate_batch(
@@ -461,10 +450,12 @@ class SurfaceLight(PredictedSearch):
             evaluation,
             cost=query.samples,
             predicted=RAYS_PER_PIXEL,  # samples per pixel of a predicted image
-            picture=round_to_8_bit(image) if query.includes_image else None,
+            picture=color.round_to_8_bit(image) if query.includes_image else None,
         )
 
-    def _evaluate_over_conditions(self, query: Query) -> Evaluation:
+    def _evaluate_over_conditions(
+        self, query: prediction.Query
+    ) -> prediction.Evaluation:
         """Evaluate a query of a search by its mean over conditions.
 
         An image is predicted under each of the `conditions_per_evaluation` conditions.
@@ -488,7 +479,7 @@ class SurfaceLight(PredictedSearch):
             return evaluation
         return replace(evaluation, picture=self._predict_clean_image(query.u))
 
-    def _find_set_index(self, query: Query) -> int:
+    def _find_set_index(self, query: prediction.Query) -> int:
         """Return the index of the set of conditions under which a query is evaluated."""
         if self._reuses_conditions(query.kind):
             return query.row_index % N_CONDITION_SETS
@@ -496,7 +487,7 @@ class SurfaceLight(PredictedSearch):
 
     def _predict_slice(
         self,
-        query: Query,
+        query: prediction.Query,
         full_configurations: Sequence[Tensor],
         batch: slice,
         u: Tensor,
@@ -521,7 +512,7 @@ class SurfaceLight(PredictedSearch):
             # Without a seed, the conditions leave the scene unchanged.
             clean_full_u = self.problem.make_full_configuration(u)
             images = self._predict_images([clean_full_u], u)
-            return round_to_8_bit(images[0])
+            return color.round_to_8_bit(images[0])
 
     def _reuses_conditions(self, kind: str) -> bool:
         """Return whether a search uses a few sets of conditions in turn.
@@ -614,7 +605,7 @@ class SurfaceLight(PredictedSearch):
             self._stored_views[key] = list(self.renderer.trace_views(inputs))
         return self._stored_views[key]
 
-    def replay(self, query: Query) -> None:
+    def replay(self, query: prediction.Query) -> None:
         """Bring the predictor to its state at a query: compare it if that is due.
 
         Before a query is evaluated, and also if its evaluation is read from the store,
@@ -647,7 +638,7 @@ class SurfaceLight(PredictedSearch):
         elif self._searches_colors:
             self._renew_light(query.u)
 
-    def _is_comparison_due(self, query: Query) -> bool:
+    def _is_comparison_due(self, query: prediction.Query) -> bool:
         """Return whether predictions have to be compared before a query.
 
         Other kinds than "search", such as "baseline", and the ranking take the
@@ -667,7 +658,7 @@ class SurfaceLight(PredictedSearch):
         assert self.n_renewals is not None  # None only for a `Bank`
         self.n_renewals += 1
 
-    def _compare(self, u: Tensor, index: int) -> Deviation:
+    def _compare(self, u: Tensor, index: int) -> prediction.Deviation:
         """Compare predicted images with traced ones, and store the deviation.
 
         The first view is that of u. In the other views, searched cameras and
@@ -683,7 +674,7 @@ class SurfaceLight(PredictedSearch):
         seed = seeds.derive_seed(problem.seed, kind, index)
         with self.measure_seconds():
             configurations = self._sample_compared_configurations(u, seed)
-            conditions = self._choose_conditions(kind, index, N_VIEWS)
+            conditions = self._choose_conditions(kind, index, prediction.N_VIEWS)
             full_configurations = [
                 torch.cat([view_u, condition])
                 for view_u, condition in zip(configurations, conditions, strict=True)
@@ -694,7 +685,9 @@ class SurfaceLight(PredictedSearch):
     def _sample_compared_configurations(self, u: Tensor, seed: int) -> Tensor:
         """Return the searched coordinates (N_VIEWS, d) of the views of a comparison."""
         generator = torch.Generator().manual_seed(seed)
-        random_configurations = self.problem.domain.sample(generator, N_VIEWS)
+        random_configurations = self.problem.domain.sample(
+            generator, prediction.N_VIEWS
+        )
         # random in the moving coordinates, else u
         configurations = torch.where(self._is_moving, random_configurations, u)
         configurations[0] = u  # the first view is that of u itself
@@ -702,7 +695,7 @@ class SurfaceLight(PredictedSearch):
 
     def _compare_surface_view(
         self, full_configurations: Sequence[Tensor], seed: int, number: int
-    ) -> ComparedView:
+    ) -> prediction.ComparedView:
         """Compare the predicted image of a view, by its number, with traced ones."""
         # The allowed error of the margin grows with the change that the search has made
         # (`Problem.compare_view`). Random coordinates are no such change. If no colors

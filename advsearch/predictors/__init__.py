@@ -1,0 +1,1 @@
+"""Predictors of images besides the matrix of light transport (`engine.prediction`)."""
