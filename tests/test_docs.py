@@ -250,8 +250,9 @@ def test_the_page_about_losses_of_ones_own_runs(monkeypatch: pytest.MonkeyPatch)
 
 @pytest.mark.docs
 def test_the_predictor_of_the_page_is_as_good_as_a_render() -> None:
-    renderer = advsearch.load_scene("mug").renderer({"environment": {"exposure": [-2, 0]}}, resolution=32)
-    predictor = code_with("development.md", "Predictor")["Dimmed"](renderer, renderer.start, seed=1)
+    camera = {"azimuth": 40, "elevation": 25, "roll": 0, "sizes": 2.4, "exposure": [-2, 0]}
+    renderer = advsearch.load_scene("mug").renderer({"camera": camera}, resolution=32)
+    predictor = code_with("extending.md", "Predictor")["StillPredictor"](renderer, renderer.start, seed=1)
     u = torch.tensor([0.2], requires_grad=True)
     picture = predictor(u)
     picture.mean().backward()
