@@ -20,7 +20,7 @@ class BuiltIn(NamedTuple):
     Attributes:
         kind: "experiment", "control", "policy", "task", "model source", "recognizer" of
             networks from Python, "exporter", "reader" of mesh files, "converter" of
-            files to glTF, or "predictor" of images.
+            files to glTF, "predictor" of images, or "cluster" on which workers run.
         name: its name on the command line. For a reader or converter it is the suffix
             of its files, and for a recognizer the library of its networks.
         import_path: "module:attribute" that is imported when the part is used.
@@ -42,6 +42,7 @@ _PREDICTORS = "advsearch.predictors"
 _MODELS = "advsearch.models"
 _EXPORTERS = "advsearch.cli.exporters"
 _READERS = "advsearch.scene.importing"
+_CLUSTERS = "advsearch.cluster"
 
 BUILT_INS = (
     BuiltIn(
@@ -549,6 +550,12 @@ BUILT_INS = (
         "usdz",
         f"{_READERS}.usd:convert_usd",
         "a package of OpenUSD, through glTF",
+    ),
+    BuiltIn(
+        "cluster",
+        "dask",
+        f"{_CLUSTERS}.dask_executor:DaskExecutor",
+        "the workers of a Dask scheduler, or of a cluster that Dask starts",
     ),
 )
 

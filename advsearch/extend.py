@@ -1,5 +1,5 @@
 """The interface for extensions of advsearch: experiments, controls, tasks, policies,
-model sources, readers and exporters.
+model sources, readers, exporters and clusters.
 
     from advsearch.extend import Control, Parameter, Values
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from advsearch.api import workbench as workbench
     from advsearch.attacks import Policy as Policy
     from advsearch.attacks import policies as policies
+    from advsearch.cluster import workers as workers
     from advsearch.config import DerivativeConfig as DerivativeConfig
     from advsearch.config import SceneConfig as SceneConfig
     from advsearch.controls.base import Choice as Choice
@@ -130,6 +131,7 @@ _MODULES = {
     "views": "advsearch.report.views",
     "wording": "advsearch.report.wording",
     "workbench": "advsearch.api.workbench",
+    "workers": "advsearch.cluster.workers",
     "writing": "advsearch.trust.writing",
 }
 """Modules that belong to the interface with all their public names."""

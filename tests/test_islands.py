@@ -24,6 +24,7 @@ CORE = {
     "reader": {"obj", "ply", "stl", "gltf", "glb", "vrm"},
     "converter": set[str](),
     "predictor": {"matrix"},
+    "cluster": set[str](),
 }
 """The built-in parts that are no islands, by kind."""
 
@@ -131,13 +132,14 @@ def list_parts():
 def use_parts():
     import advsearch.cli.main
     from advsearch.attacks.policies import POLICIES
+    from advsearch.cluster.workers import CLUSTERS
     from advsearch.controls import CONTROLS
     from advsearch.engine.prediction import PREDICTORS
     from advsearch.models.loading import SOURCES
     from advsearch.runs.exporters import EXPORTERS
     from advsearch.scene.importing.readers import READERS, get_reader, list_suffixes
     from advsearch.tasks import TASKS
-    registries = (CONTROLS, POLICIES, TASKS, SOURCES, EXPORTERS, READERS, PREDICTORS)
+    registries = (CONTROLS, POLICIES, TASKS, SOURCES, EXPORTERS, READERS, PREDICTORS, CLUSTERS)
     assert all(registry[name] for registry in registries for name in registry)
     assert all(get_reader(suffix) for suffix in list_suffixes())
 

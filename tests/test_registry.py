@@ -154,6 +154,21 @@ def test_its_names_are_listed_and_its_parts_work_together(installed: Path, tmp_p
     assert view["answers"][0]["probability"] is None and 0.3 < float(view["answers"][0]["label"].split()[0]) < 0.5
 
 
+@pytest.mark.medium
+@pytest.mark.docs
+def test_its_cluster_does_the_work_of_a_sweep(installed: Path, tmp_path: Path) -> None:
+    small = ["--model", "zoo:tiny", "--resolution", "32", "--spp", "1", "--denoise", "none", "--batch", "4", "--quiet"]
+    command, trials = examples()[2], ["--trials", "0"]
+    assert command[-4:] == ["--cluster", "pool", "--workers", "2"]
+    shared, single = advsearch(
+        installed,
+        [*command, *small, *trials, "--run", str(tmp_path / "pool")],
+        [*command[:-4], *small, *trials, "--run", str(tmp_path / "here")],
+    )
+    assert shared["shared"]["batches"] == 6 and "shared" not in single
+    assert (shared["correct"], shared["worst"]) == (single["correct"], single["worst"])
+
+
 USE_PARTS = """
 import json, sys
 from pathlib import Path

@@ -34,6 +34,7 @@ from advsearch.attacks.policies import pgd
 from advsearch.attacks.verification import WORST_CASE
 from advsearch.cli.main import list_commands
 from advsearch.cli.show import REGISTRIES
+from advsearch.cluster.workers import CLUSTERS
 from advsearch.controls import CONTROLS, texture
 from advsearch.controls.support.norms import DEFAULT_EPSILON
 from advsearch.files import MESHES
@@ -574,6 +575,7 @@ MADE_UP = {"tests/test_architecture.py", "tests/test_docs.py", "tests/test_regis
 """Tests of such rules, which name modules that are not there."""
 NAME = re.compile(r"(?<![\w./-])`?(advsearch(?:\.[A-Za-z_]\w*)+)(?:\(\))?`?(?![\w/-])")
 REGISTERED = (
+    CLUSTERS,
     CONTROLS,
     EXPERIMENTS,
     EXPORTERS,

@@ -299,7 +299,7 @@ FAULTS = (
     Fault(
         "cluster: any version may work",
         "advsearch/cluster/dask_executor.py",
-        "if version == compute_version():",
+        "if version == workers.compute_version():",
         "if isinstance(version, str):",
         ("tests/cluster/test_executors.py",),
     ),

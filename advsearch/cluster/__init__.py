@@ -13,9 +13,8 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
-from advsearch.errors import ClusterError
 from advsearch.files import JsonObject
 from advsearch.trust.code import allowed_code
 
@@ -56,19 +55,6 @@ class BatchResult:
     machine: str | None = None
     # Why there is no value; empty if there is one. Only a single item has no value.
     failure_reason: str = ""
-
-    def require_value(self, title: str) -> Any:
-        """Return the value of the batch, which must have been computed.
-
-        Args:
-            title: name of the batch, for the message.
-
-        Raises:
-            ClusterError: if there is no value.
-        """
-        if self.failure_reason:
-            raise ClusterError(f"{title}: {self.failure_reason}")
-        return self.value
 
 
 @dataclass
@@ -154,4 +140,45 @@ class WorkerExecutor(Executor):
 
         Raises:
             ClusterError: if there has been no worker for long.
+        """
+
+
+class ClusterExecutor(WorkerExecutor):
+    """An executor on the workers of a cluster, which the setting `cluster` names.
+
+    Other packages may add one (docs/extending.md).
+
+    Attributes:
+        expected_values: the values of `cluster` that it reads, for messages, such as "a
+            .yaml file".
+    """
+
+    expected_values: ClassVar[tuple[str, ...]]
+
+    @classmethod
+    @abstractmethod
+    def reads(cls, cluster: str) -> bool:
+        """Return whether `open` reads a value of the setting `cluster`."""
+
+    @classmethod
+    @abstractmethod
+    def open(
+        cls,
+        task: WorkerTask,
+        n_workers: int | None,
+        cluster: str,
+        report_message: Callable[[str], None],
+    ) -> tuple[WorkerExecutor, WorkerTask]:
+        """Return an executor on a cluster, and the task that its workers run.
+
+        Args:
+            task: function and settings that the workers load.
+            n_workers: number of workers to start, which is the setting `workers`; None
+                for the default.
+            cluster: the value of the setting `cluster`.
+            report_message: function that is called with messages for the user.
+
+        Raises:
+            InputError: a setting is wrong, or a package is not installed.
+            ClusterError: the cluster does not answer.
         """

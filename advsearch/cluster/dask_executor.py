@@ -21,27 +21,9 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
-from advsearch.cluster import (
-    MAX_DEATHS,
-    WorkerDiedError,
-    WorkerExecutor,
-    WorkerStats,
-    WorkerTask,
-)
-from advsearch.cluster.worker import (
-    INPUTS,
-    Failure,
-    Reply,
-    compute_digests,
-    compute_version,
-    make_private_directory,
-    read_files,
-    write_files,
-)
-from advsearch.errors import ClusterError, FileFormatError, InputError
-from advsearch.settings import read_yaml
+from advsearch.extend import InputError, errors, settings, workers
 
 # Maximum seconds to connect to a scheduler at first, and after the connection was lost.
 CONNECT_SECONDS = 30.0
@@ -57,7 +39,7 @@ and a worker that dies is no error here.
 """
 CONFIG = {
     # A scheduler that was not started by this process has a limit of its own.
-    "distributed.scheduler.allowed-failures": MAX_DEATHS - 1,
+    "distributed.scheduler.allowed-failures": workers.MAX_DEATHS - 1,
     # a worker that starts on a busy machine may take long
     "distributed.comm.timeouts.connect": "120s",
     "distributed.comm.timeouts.tcp": "120s",
@@ -112,7 +94,7 @@ def make_file_plugin(contents: Mapping[str, bytes]) -> Any:
             # An error is ignored here: a worker that lacks files reports that when the
             # next call needs them.
             with suppress(OSError):
-                write_files(contents, make_private_directory() / INPUTS)
+                workers.write_files(contents, workers.make_private_directory())
 
     return SentFiles()
 
@@ -125,36 +107,71 @@ def call_on_worker(function: Callable[..., Any], *args: Any) -> tuple[str, Any]:
     return str(get_worker().address), function(*args)
 
 
-class DaskExecutor(WorkerExecutor):
-    """An executor on a Dask cluster, see `WorkerExecutor`. It has to be shut down.
+class DaskExecutor(workers.ClusterExecutor):
+    """An executor on a Dask cluster, see `ClusterExecutor`. It has to be shut down.
 
     A worker is fit if it can do the task. It is refused if it has another version of
     advsearch, or if a call showed that it cannot.
     """
 
+    expected_values: ClassVar[tuple[str, ...]] = (
+        "the address of a scheduler such as tcp://10.0.0.1:8786",
+        "a .yaml file",
+    )
+
+    @classmethod
+    def reads(cls, cluster: str) -> bool:
+        return cluster.startswith(ADDRESS_SCHEMES) or cluster.endswith(FILE_SUFFIXES)
+
+    @classmethod
+    def open(
+        cls,
+        task: workers.WorkerTask,
+        n_workers: int | None,
+        cluster: str,
+        report_message: Callable[[str], None],
+    ) -> tuple[DaskExecutor, workers.WorkerTask]:
+        """Return an executor on a cluster, and the task with the digests of its files.
+
+        A worker compares the digests to check that it has the same files; see
+        `ClusterExecutor.open`.
+
+        Raises:
+            InputError: Dask is not installed, or an argument is wrong.
+            ClusterError: no scheduler answers.
+        """
+        site = parse_site(n_workers, cluster)
+        if importlib.util.find_spec("distributed") is None:
+            raise InputError(
+                "cluster: needs Dask; pip install 'advsearch[dask]', or leave "
+                "`cluster` out"
+            )
+        contents = workers.read_files(task)
+        executor = cls(site, contents, report_message)
+        return executor, replace(task, digests=workers.compute_digests(contents))
+
     def __init__(
         self,
         site: ClusterSite,
         contents: Mapping[str, bytes],
-        tell: Callable[[str], None],
+        report_message: Callable[[str], None],
     ) -> None:
         """Connect to the scheduler, or start the cluster.
 
         Args:
             site: the scheduler or the cluster on which the workers run.
             contents: contents of the task's files, by path, for workers that lack them.
-            tell: function that is called with messages for the user.
+            report_message: function that is called with messages for the user.
 
         Raises:
             ClusterError: no scheduler answers.
         """
         self.description = site.description
-        self.stats = WorkerStats()
-        self.link = ""  # address of a page that shows the workers; "" if there is none
+        self.stats = workers.WorkerStats()
         self._site = site
         self._contents = contents
         self._plugin_name = f"advsearch files {uuid.uuid4()}"
-        self._tell = tell
+        self._report_message = report_message
         self._client: Any = None
         self._cluster: Any = None
         self._connection: Any = None
@@ -171,12 +188,12 @@ class DaskExecutor(WorkerExecutor):
         # when workers were last counted, and since when no fit worker is connected
         self._counted_at = self._alone_since = time.monotonic()
         try:
-            self._open(CONNECT_SECONDS)
+            self._open_connection(CONNECT_SECONDS)
         except BaseException:
             self.shutdown()
             raise
 
-    def _open(self, seconds: float) -> None:
+    def _open_connection(self, seconds: float) -> None:
         """Start the cluster if the site has one, and connect to its scheduler.
 
         Args:
@@ -199,7 +216,7 @@ class DaskExecutor(WorkerExecutor):
         self._client = self._connect_until(security, deadline)
         # compared in `count_workers`, to notice that the client has connected again
         self._connection = self._client.scheduler_comm
-        self._set_link()
+        self._report_page()
 
     def _connect_until(self, security: Any, deadline: float) -> Any:
         """Return a client of the scheduler, which is tried until a deadline.
@@ -229,22 +246,22 @@ class DaskExecutor(WorkerExecutor):
                     raise self._make_connection_error(error) from error
                 time.sleep(LOOK_SECONDS)
 
-    def _make_connection_error(self, error: Exception) -> ClusterError:
+    def _make_connection_error(self, error: Exception) -> errors.ClusterError:
         """Return the error for a scheduler that does not answer."""
-        return ClusterError(
+        return errors.ClusterError(
             f"{self.description}: there is no scheduler that answers "
             f"({error or type(error).__name__}); start one with dask "
             "scheduler, check address and certificates, and go on with "
             "advsearch resume"
         )
 
-    def _set_link(self) -> None:
-        """Store and report the address of Dask's page about the workers."""
+    def _report_page(self) -> None:
+        """Report the address of Dask's page about the workers, if there is one."""
         # Dask draws its pages with bokeh; without it the link leads to an error.
         has_pages = importlib.util.find_spec("bokeh") is not None
-        self.link = str(self._client.dashboard_link or "") if has_pages else ""
-        if self.link:
-            self._tell(f"Dask shows its workers at {self.link}")
+        link = self._client.dashboard_link if has_pages else None
+        if link:
+            self._report_message(f"Dask shows its workers at {link}")
 
     def _connect(self, security: Any, deadline: float) -> Any:
         """Return a client of the scheduler; start the cluster first if that is due.
@@ -355,7 +372,7 @@ class DaskExecutor(WorkerExecutor):
         )
         fit = frozenset[str]()
         for address, version in versions.items():
-            if version == compute_version():
+            if version == workers.compute_version():
                 fit |= {address}
             else:
                 self._refuse_version(address, version)
@@ -374,8 +391,8 @@ class DaskExecutor(WorkerExecutor):
         if isinstance(version, str):
             self._refuse(
                 address,
-                f"it has advsearch {version}, and {compute_version()} asks; install "
-                "the same on both",
+                f"it has advsearch {version}, and {workers.compute_version()} asks; "
+                "install the same on both",
             )
         elif isinstance(version, (ImportError, AttributeError)):
             self._refuse(
@@ -383,12 +400,12 @@ class DaskExecutor(WorkerExecutor):
                 f"it cannot begin ({version}); install the same advsearch there",
             )
 
-    async def _versions(self, workers: list[str]) -> dict[str, Any]:
+    async def _versions(self, addresses: list[str]) -> dict[str, Any]:
         """Return the version of advsearch of each worker by address, or the error of a
         worker that fails.
         """
         versions: dict[str, Any] = await self._client.run(
-            compute_version, workers=workers, on_error="return"
+            workers.compute_version, workers=addresses, on_error="return"
         )
         return versions
 
@@ -398,7 +415,7 @@ class DaskExecutor(WorkerExecutor):
         if address not in self._refusal_by_address:
             self._refusal_by_address[address] = reason
             self.stats.refused += 1
-            self._tell(f"{address} is given nothing: {reason}")
+            self._report_message(f"{address} is given nothing: {reason}")
 
     def _check_waiting_time(self, now: float) -> None:
         """Raise ClusterError if there has been no fit worker for too long.
@@ -413,7 +430,7 @@ class DaskExecutor(WorkerExecutor):
         if now - self._alone_since > patience:
             reasons = "; ".join(dict.fromkeys(self._refusal_by_address.values()))
             remark = f" ({reasons})" if reasons else ""
-            raise ClusterError(
+            raise errors.ClusterError(
                 f"{self.description}: there was no worker that can do it for "
                 f"{patience:.0f} s{remark}; what was stored is kept, so that the run can "
                 "go on with advsearch resume"
@@ -425,7 +442,7 @@ class DaskExecutor(WorkerExecutor):
         It may be a new scheduler with other workers. So the fit and the refused workers
         are forgotten, and files will be sent again.
         """
-        self._tell(
+        self._report_message(
             f"{self.description}: the scheduler has gone; what was under way will be "
             "done again"
         )
@@ -433,7 +450,7 @@ class DaskExecutor(WorkerExecutor):
         self._usable_addresses = frozenset()
         self._refusal_by_address = {}
         self._sending = None
-        self._open(RECONNECT_SECONDS)
+        self._open_connection(RECONNECT_SECONDS)
         self._alone_since = time.monotonic()
 
     # ---- calls
@@ -472,10 +489,10 @@ class DaskExecutor(WorkerExecutor):
 
         failed_starts = 0
         while client.status == "running":
-            workers = sorted(self._usable_addresses)
-            future = _submit_call(client, function, args, workers)
+            addresses = sorted(self._usable_addresses)
+            future = _submit_call(client, function, args, addresses)
             try:
-                result = await self._wait_for_accepted(client, future, workers)
+                result = await self._wait_for_accepted(client, future, addresses)
                 if result is not None:
                     return result[1]
             except asyncio.CancelledError:
@@ -484,8 +501,8 @@ class DaskExecutor(WorkerExecutor):
                 if future.status != "cancelled":
                     raise
             except KilledWorker:
-                raise WorkerDiedError(
-                    f"no answer: {MAX_DEATHS} workers died of it"
+                raise workers.WorkerDiedError(
+                    f"no answer: {workers.MAX_DEATHS} workers died of it"
                 ) from None
             except Exception as error:
                 if _shows_failed_start(error, future):
@@ -502,36 +519,38 @@ class DaskExecutor(WorkerExecutor):
         raise BrokenExecutor(f"{self.description}: the scheduler has gone")
 
     async def _wait_for_accepted(
-        self, client: Any, future: Any, workers: list[str]
+        self, client: Any, future: Any, addresses: list[str]
     ) -> tuple[str, Any] | None:
         """Return the address of a call's worker and its value, if the reply is accepted.
 
         Args:
             client: client of the connection that was used.
             future: Dask's future of the call.
-            workers: addresses of the workers that may run it.
+            addresses: addresses of the workers that may run it.
 
         Returns:
             None if all workers have disconnected, or if the worker was unfit.
         """
-        result = await self._wait(future, workers)
+        result = await self._wait(future, addresses)
         if result is None:
             return None
         address, value = result
         is_rejected = await self._rejects_reply(client, address, value)
         return None if is_rejected else result
 
-    def _make_start_error(self, error: Exception) -> ClusterError:
+    def _make_start_error(self, error: Exception) -> errors.ClusterError:
         """Return the error for a call that workers cannot begin."""
         text = f"{type(error).__name__}: {error}"
-        return ClusterError(f"{self.description}: a worker cannot begin ({text})")
+        return errors.ClusterError(
+            f"{self.description}: a worker cannot begin ({text})"
+        )
 
-    async def _wait(self, future: Any, workers: list[str]) -> tuple[str, Any] | None:
+    async def _wait(self, future: Any, addresses: list[str]) -> tuple[str, Any] | None:
         """Wait for a future of Dask, as long as a worker that may run it is left.
 
         Args:
             future: the future.
-            workers: addresses of the workers that may run it.
+            addresses: addresses of the workers that may run it.
 
         Returns:
             The address of the worker and the value; None if all workers are gone.
@@ -547,7 +566,7 @@ class DaskExecutor(WorkerExecutor):
                 done, _ = await asyncio.wait([fetching], timeout=LOOK_SECONDS)
                 if done:
                     return fetching.result()
-                if not self._usable_addresses.intersection(workers):
+                if not self._usable_addresses.intersection(addresses):
                     return None
         finally:
             fetching.cancel()
@@ -565,14 +584,14 @@ class DaskExecutor(WorkerExecutor):
             address: address of the worker.
             value: value that the call returned, a `Reply` for batches.
         """
-        failure = value.failure if isinstance(value, Reply) else None
+        failure = value.failure if isinstance(value, workers.Reply) else None
         # Another call may be sending them now; then `_send_files` waits for it.
         were_files_sent = self._sending is not None and self._sending.done()
-        if failure is Failure.MISSING_FILES and not were_files_sent:
+        if failure is workers.Failure.MISSING_FILES and not were_files_sent:
             await self._send_files(client)
             return True
         # A worker that still lacks files could not write those that were sent.
-        if failure in (Failure.UNFIT, Failure.MISSING_FILES):
+        if failure in (workers.Failure.UNFIT, workers.Failure.MISSING_FILES):
             self._refuse(address, value.error)
             return True
         return False
@@ -640,7 +659,7 @@ def _submit_call(
     client: Any,
     function: Callable[..., Any],
     args: tuple[Any, ...],
-    workers: list[str],
+    addresses: list[str],
 ) -> Any:
     """Return Dask's future of a call that one of some workers shall run, once.
 
@@ -648,13 +667,13 @@ def _submit_call(
         client: client of the connection that is open now.
         function: function to call.
         args: its positional arguments.
-        workers: addresses of the workers.
+        addresses: addresses of the workers.
     """
     return client.submit(
         call_on_worker,
         function,
         *args,
-        workers=workers,
+        workers=addresses,
         allow_other_workers=False,
         pure=False,
         retries=0,
@@ -673,6 +692,7 @@ def _shows_failed_start(error: Exception, future: Any) -> bool:
 
 
 ADDRESS_SCHEMES = ("tcp://", "tls://", "ws://", "wss://")
+FILE_SUFFIXES = (".yaml", ".yml")
 
 JOBS = (
     "SLURMCluster",
@@ -692,96 +712,67 @@ rejected: with an arbitrary class, a file could run arbitrary code.
 """
 
 
-def open_dask(
-    task: WorkerTask, workers: int | None, cluster: str, tell: Callable[[str], None]
-) -> tuple[DaskExecutor, WorkerTask]:
-    """Return an executor on a cluster, and the task with the digests of its files.
-
-    A worker compares the digests to check that it has the same files.
-
-    Args:
-        task: function and settings that the workers load.
-        workers: number of workers to start; None for the default.
-        cluster: address of a scheduler, or path of a YAML file that describes the
-            cluster.
-        tell: function that is called with messages for the user.
-    """
-    site = parse_site(workers, cluster)
-    if importlib.util.find_spec("distributed") is None:
-        raise InputError(
-            "cluster: needs Dask; pip install 'advsearch[dask]', or leave `cluster` out"
-        )
-    contents = read_files(task)
-    return DaskExecutor(site, contents, tell), replace(
-        task, digests=compute_digests(contents)
-    )
-
-
-def parse_site(workers: int | None, cluster: str) -> ClusterSite:
+def parse_site(n_workers: int | None, cluster: str) -> ClusterSite:
     """Return the scheduler or the cluster on which workers run.
 
     Args:
-        workers: number of workers to start; None for the default.
+        n_workers: number of workers to start; None for the default.
         cluster: address of a scheduler, such as "tcp://10.0.0.1:8786", or path of a
             YAML file that describes the cluster.
 
     Raises:
-        InputError: `cluster` is neither, or `workers` is set although the scheduler has
-            workers already.
+        FileFormatError: the file has wrong or contradictory entries.
+        InputError: `workers` is set although the scheduler has workers already, or a
+            package for the cluster is not installed.
     """
     if cluster.startswith(ADDRESS_SCHEMES):
         site = ClusterSite(cluster, address=cluster)
-    elif cluster.endswith((".yaml", ".yml")):
-        site = _read_site(Path(cluster), workers)
     else:
-        raise InputError(
-            "cluster: expected the address of a scheduler such as tcp://10.0.0.1:8786, "
-            f"local, or a .yaml file, got {cluster!r}"
-        )
-    _check_no_worker_number(site, workers)
+        site = _read_site(Path(cluster), n_workers)
+    _check_no_worker_number(site, n_workers)
     return site
 
 
-def _check_no_worker_number(site: ClusterSite, workers: int | None) -> None:
+def _check_no_worker_number(site: ClusterSite, n_workers: int | None) -> None:
     """Check that no number of workers is set for a scheduler, which has workers.
 
     Args:
         site: the scheduler or the cluster.
-        workers: number of workers to start; None if it is not set.
+        n_workers: number of workers to start; None if it is not set.
 
     Raises:
         InputError: it is.
     """
-    if site.address and workers is not None:
+    if site.address and n_workers is not None:
         raise InputError(
             "workers: the scheduler of `cluster` says how many there are; "
             "leave one of the two out"
         )
 
 
-def _read_site(path: Path, workers: int | None) -> ClusterSite:
+def _read_site(path: Path, n_workers: int | None) -> ClusterSite:
     """Read where workers run from a YAML file.
 
     Args:
         path: path of the file.
-        workers: number of workers to start; None for the number in the file. Ignored
+        n_workers: number of workers to start; None for the number in the file. Ignored
             for the address of a scheduler, whose workers run already.
 
     Raises:
         FileFormatError: the file has wrong or contradictory entries.
         InputError: a package for the cluster is not installed.
     """
-    entries: dict[str, Any] = read_yaml(path)
+    entries: dict[str, Any] = settings.read_yaml(path)
     _check_entries(path, entries)
     security = _read_security(path, entries)
-    count = entries.get("workers") if workers is None else workers
+    count = entries.get("workers") if n_workers is None else n_workers
     _check_worker_count(path, count)
     if "address" in entries:
         return _read_scheduler(path, entries, security)
     name = str(entries["class"])
     start = partial(_import_cluster(path, name), **(entries.get("arguments") or {}))
-    n_workers = 1 if count is None else count
-    return ClusterSite(name, start=start, security=security, count=n_workers)
+    count = 1 if count is None else count
+    return ClusterSite(name, start=start, security=security, count=count)
 
 
 def _check_worker_count(path: Path, count: object) -> None:
@@ -792,7 +783,7 @@ def _check_worker_count(path: Path, count: object) -> None:
     """
     is_count = isinstance(count, int) and not isinstance(count, bool) and count >= 1
     if count is not None and not is_count:
-        raise FileFormatError(
+        raise errors.FileFormatError(
             f"{path}: workers: expected a whole number of at least 1, got {count!r}"
         )
 
@@ -835,11 +826,11 @@ def _read_scheduler(
     """
     address = str(entries["address"])
     if not address.startswith(ADDRESS_SCHEMES):
-        raise FileFormatError(
+        raise errors.FileFormatError(
             f"{path}: address: expected tcp://HOST:PORT or tls://HOST:PORT"
         )
     if "workers" in entries:
-        raise FileFormatError(
+        raise errors.FileFormatError(
             f"{path}: workers: the workers of a scheduler run already; leave it out"
         )
     return ClusterSite(address, address=address, security=security)
@@ -859,7 +850,7 @@ def _check_entries(path: Path, entries: dict[str, Any]) -> None:
         mapping = entries.get(name) or {}
         is_mapping = isinstance(mapping, dict)
         if not is_mapping or not all(isinstance(key, str) for key in mapping):
-            raise FileFormatError(
+            raise errors.FileFormatError(
                 f"{path}: {name}: expected names and values, got {mapping!r}"
             )
 
@@ -881,7 +872,7 @@ def _check_entry_names(path: Path, entries: dict[str, Any]) -> None:
             "expected either address, or class with arguments and workers; either "
             "may have security"
         )
-        raise FileFormatError(f"{path}: {expected}; {got}")
+        raise errors.FileFormatError(f"{path}: {expected}; {got}")
 
 
 def _import_cluster(path: Path, name: str) -> Any:
@@ -892,7 +883,7 @@ def _import_cluster(path: Path, name: str) -> Any:
         InputError: its package is not installed.
     """
     if name not in CLUSTER_CLASSES:
-        raise FileFormatError(
+        raise errors.FileFormatError(
             f"{path}: class: expected one of {', '.join(CLUSTER_CLASSES)}, got {name!r}"
         )
     try:

@@ -193,18 +193,18 @@ def compute_digests(contents: Mapping[str, bytes]) -> dict[str, str]:
 def locate_sent_files(digests: Mapping[str, str], folder: Path) -> dict[str, Path]:
     """Return where files that were sent are stored on a worker, by original path.
 
-    Each set of files has a separate directory below `folder`, named by a digest of the
+    Each set of files has a separate directory below `INPUTS`, named by a digest of the
     set. The files have the same paths below it as on the sending machine, so that
     relative names in them stay valid.
 
     Args:
         digests: digests of the files by their original paths.
-        folder: directory for all files that were sent.
+        folder: directory of the worker.
     """
     # 32 hexadecimal digits are 128 bits, enough for no two sets to have one name.
     name = hashlib.sha256(json.dumps(sorted(digests.items())).encode()).hexdigest()[:32]
     return {
-        path: folder / name / Path(path).relative_to(Path(path).anchor)
+        path: folder / INPUTS / name / Path(path).relative_to(Path(path).anchor)
         for path in digests
     }
 
@@ -212,6 +212,10 @@ def locate_sent_files(digests: Mapping[str, str], folder: Path) -> dict[str, Pat
 def write_files(contents: Mapping[str, bytes], folder: Path) -> None:
     """Write files that were sent, each in one step, so that other workers on this
     machine never see half of one.
+
+    Args:
+        contents: contents of the files by their original paths.
+        folder: directory of the worker.
     """
     paths = locate_sent_files(compute_digests(contents), folder)
     for name, data in contents.items():
@@ -230,7 +234,7 @@ def resolve_files(task: WorkerTask, folder: Path) -> WorkerTask:
 
     Args:
         task: the task, with the digests of its files.
-        folder: directory for files that were sent.
+        folder: directory of the worker.
 
     Raises:
         MissingFilesError: a file is missing in both places, or has other content.
@@ -398,7 +402,7 @@ def load_task(task: WorkerTask) -> BatchFunction:
     describe_machine()
     # The user allowed this code to run in the main process.
     allow_code(*task.allowed_modules)
-    task = resolve_files(task, folder / INPUTS)
+    task = resolve_files(task, folder)
     threads.configure(task.threads)
     make_function: Callable[[Any], BatchFunction] = load_attribute(task.function_path)
     # The least recently used function is dropped before another is loaded, so that both

@@ -2,6 +2,9 @@
 
 A batch whose worker was lost is submitted again. If several workers die during it, its
 items are submitted one by one, to find the item that kills them.
+
+`advsearch.extend` offers this module to added clusters. Its `__all__` has also what
+these import.
 """
 
 from __future__ import annotations
@@ -17,8 +20,11 @@ from itertools import islice
 from typing import Any
 
 from advsearch import threads
+from advsearch.catalog import list_built_ins
 from advsearch.cluster import (
+    MAX_DEATHS,
     BatchResult,
+    ClusterExecutor,
     WorkerDiedError,
     WorkerExecutor,
     Workers,
@@ -30,13 +36,44 @@ from advsearch.cluster.worker import (
     LOAD_DEADLINE,
     Failure,
     Reply,
+    compute_digests,
+    compute_version,
     describe_machine,
     digest_machine,
+    make_private_directory,
+    read_files,
     run_batch,
+    write_files,
 )
-from advsearch.errors import ClusterError
+from advsearch.errors import ClusterError, InputError
 from advsearch.interrupts import INTERRUPTS
-from advsearch.registry import load_attribute
+from advsearch.registry import Registry
+
+__all__ = [
+    "CLUSTERS",
+    "MAX_DEATHS",
+    "ClusterExecutor",
+    "Failure",
+    "PoolWorkers",
+    "Reply",
+    "WorkerDiedError",
+    "WorkerStats",
+    "WorkerTask",
+    "compute_digests",
+    "compute_version",
+    "make_private_directory",
+    "open_workers",
+    "read_files",
+    "write_files",
+]
+
+CLUSTERS: Registry[type[ClusterExecutor]] = Registry(
+    "advsearch.clusters",
+    list_built_ins("cluster"),
+    "a subclass of ClusterExecutor",
+    lambda name, entry: isinstance(entry, type) and issubclass(entry, ClusterExecutor),
+)
+"""Executors on clusters, imported when a cluster is opened."""
 
 LOCAL = "local"  # name of the cluster that is this machine
 
@@ -58,7 +95,7 @@ class PoolWorkers:
         self,
         executor: WorkerExecutor,
         task: WorkerTask,
-        tell: Callable[[str], None] = lambda text: None,
+        report_message: Callable[[str], None] = lambda text: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Make workers for a task.
@@ -66,13 +103,13 @@ class PoolWorkers:
         Args:
             executor: executor that runs calls on its workers.
             task: function and settings that the workers load.
-            tell: function that is called with messages for the user.
+            report_message: function that is called with messages for the user.
             clock: function that returns the time in seconds; tests pass another one.
         """
         self.stats: WorkerStats = executor.stats
         self._executor = executor
         self._task = task
-        self._tell = tell
+        self._report_message = report_message
         self._clock = clock
         self._this_machine = digest_machine(describe_machine())
         self._dead_starts = 0
@@ -270,7 +307,7 @@ class PoolWorkers:
             return
         self.stats.machines = {**self.stats.machines, machine: reply.machine}
         description = ", ".join(f"{key} {text}" for key, text in reply.machine.items())
-        self._tell(
+        self._report_message(
             f"{reply.worker} is another machine than this ({description}): "
             "last bits of rows may differ"
         )
@@ -347,8 +384,8 @@ def open_workers(
         task: function and settings that the workers load.
         workers: number of processes; None for the default, which is one for each core
             on this machine.
-        cluster: address of a scheduler, or path of a YAML file that describes a
-            cluster; "local" or None for this machine.
+        cluster: the cluster on which they run, such as the address of a scheduler;
+            "local" or None for this machine.
         report_message: function that is called with messages for the user.
 
     Yields:
@@ -375,9 +412,28 @@ def _open_executor(
 
     The arguments are those of `open_workers`.
     """
-    if cluster in (None, LOCAL):
+    if cluster is None or cluster == LOCAL:
         return LocalExecutor(workers or threads.count_cores()), task
-    open_dask: Callable[..., tuple[WorkerExecutor, WorkerTask]] = load_attribute(
-        "advsearch.cluster.dask_executor:open_dask"
-    )
-    return open_dask(task, workers, cluster, report_message)
+    executor_class = _find_executor_class(cluster)
+    return executor_class.open(task, workers, cluster, report_message)
+
+
+def _find_executor_class(cluster: str) -> type[ClusterExecutor]:
+    """Return the class of the executor that reads a value of the setting `cluster`.
+
+    Raises:
+        InputError: there is none, or an entry that may read it cannot be imported.
+    """
+    for executor_class in CLUSTERS.list_usable().values():
+        if executor_class.reads(cluster):
+            return executor_class
+    # An entry that cannot be imported raises its error here.
+    values = [value for name in CLUSTERS for value in CLUSTERS[name].expected_values]
+    if not values:
+        raise InputError(
+            "cluster: expected local, since no part of advsearch or of another package "
+            f"that opens clusters is installed, got {cluster!r}"
+        )
+    *first_values, last_value = values
+    expected = ", ".join([*first_values, LOCAL, f"or {last_value}"])
+    raise InputError(f"cluster: expected {expected}, got {cluster!r}")

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Generator, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,11 +17,12 @@ from typing import Any
 
 import pytest
 
-from advsearch.cluster import WorkerDiedError, Workers, WorkerStats, WorkerTask
+from advsearch import registry
+from advsearch.cluster import ClusterExecutor, WorkerDiedError, Workers, WorkerStats, WorkerTask
 from advsearch.cluster.dask_executor import CLUSTER_CLASSES, MAX_TRIES, DaskExecutor, parse_site
 from advsearch.cluster.local import LocalExecutor
 from advsearch.cluster.worker import Failure, Reply, compute_version, run_batch
-from advsearch.cluster.workers import open_workers
+from advsearch.cluster.workers import CLUSTERS, open_workers
 from advsearch.errors import ClusterError, FileFormatError, InputError
 from conftest import ROOT
 
@@ -208,7 +210,7 @@ def executor_of_nobody(**more: Any) -> Any:
     vars(executor).update(
         description="here", stats=WorkerStats(), _usable_addresses=frozenset({"tcp://here"}), _refusal_by_address={},
         _sending=None,
-        _tell=lambda text: None, _contents={}, _plugin_name="files", **more,
+        _report_message=lambda text: None, _contents={}, _plugin_name="files", **more,
     )  # fmt: skip
     return executor
 
@@ -247,7 +249,7 @@ def looked_at(versions: dict[str, Any], seconds: float) -> tuple[int, list[str]]
         _client=client, _connection=connection, _counted_at=time.monotonic(), _alone_since=then,
         _looked_at=float("-inf"),
     )  # fmt: skip
-    vars(executor).update(_usable_addresses=frozenset(), _tell=told.append)
+    vars(executor).update(_usable_addresses=frozenset(), _report_message=told.append)
     return executor.count_workers(), told
 
 
@@ -397,12 +399,8 @@ def test_a_cluster_is_an_address_a_file_or_this_machine(tmp_path: Path) -> None:
     assert place.address == "tls://10.0.0.1:8786"
     assert place.security == {"tls_ca_file": str(tmp_path / "ca.pem"), "require_encryption": True}
     assert LocalExecutor(3).description == "3 workers on this machine"
-    for workers, cluster, message in (
-        (2, "tcp://a:1", "leave one of the two out"),
-        (None, "a", "expected the address"),
-    ):
-        with pytest.raises(InputError, match=message):
-            parse_site(workers, cluster)
+    with pytest.raises(InputError, match="leave one of the two out"):
+        parse_site(2, "tcp://a:1")
     assert set(CLUSTER_CLASSES.values()) == {"dask_jobqueue", "dask_kubernetes.operator"}
 
 
@@ -411,3 +409,74 @@ def test_without_dask_the_message_is_the_command(monkeypatch: pytest.MonkeyPatch
     with pytest.raises(InputError, match="Dask"):
         with open_workers(WorkerTask("a:b", {}), workers=None, cluster="tcp://a:1", report_message=lambda text: None):
             pass
+
+
+class Outside(ClusterExecutor):
+    """Executors of another package, with one worker on this machine."""
+
+    expected_values = ("outside",)
+
+    @classmethod
+    def reads(cls, cluster: str) -> bool:
+        return cluster == "outside"
+
+    @classmethod
+    def open(cls, task: WorkerTask, n_workers: int | None, cluster: str, report_message: Any) -> Any:
+        report_message(f"{n_workers} workers on {cluster}")
+        return LocalExecutor(1), task
+
+
+def open_on(cluster: str, told: list[str]) -> Any:
+    return open_workers(WorkerTask("cluster_work:squares", {}), workers=3, cluster=cluster, report_message=told.append)
+
+
+@pytest.fixture
+def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
+    """What packages install, by its entry point."""
+    entries: dict[str, Any] = {}
+
+    def load(name: str) -> Any:
+        if isinstance(entries[name], Exception):
+            raise entries[name]
+        return entries[name]
+
+    def points(group: str) -> list[Any]:
+        return [SimpleNamespace(name=one, value=f"other:{one}", load=partial(load, one)) for one in entries]
+
+    monkeypatch.setattr(registry, "entry_points", points)
+    vars(CLUSTERS).pop("_installed", None)
+    yield entries
+    vars(CLUSTERS).pop("_installed", None)
+
+
+@pytest.mark.medium
+def test_a_cluster_of_an_installed_package_does_the_work(installed: dict[str, Any]) -> None:
+    told = list[str]()
+    installed |= {"broken": ImportError("no module x"), "outside": Outside}
+    with open_on("outside", told) as executor:
+        check(executor, 6)
+    assert told == ["3 workers on outside"]
+
+
+def test_what_no_cluster_reads_is_refused_with_what_each_reads(
+    installed: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refusal() -> str:
+        with pytest.raises(InputError) as refused, open_on("a", []):
+            pass
+        return str(refused.value)
+
+    address = "the address of a scheduler such as tcp://10.0.0.1:8786"
+    assert list(CLUSTERS) == ["dask"]
+    assert refusal() == f"cluster: expected {address}, local, or a .yaml file, got 'a'"
+    vars(CLUSTERS).pop("_installed")
+    installed |= {"outside": Outside}
+    assert refusal() == f"cluster: expected {address}, a .yaml file, local, or outside, got 'a'"
+    installed["outside"] = ImportError("no module x")
+    assert "outside = other:outside of group advsearch.clusters: cannot be imported (no module x)" in refusal()
+    monkeypatch.setattr(CLUSTERS, "built_ins", {})
+    installed["outside"] = Outside
+    assert refusal() == "cluster: expected local, or outside, got 'a'"
+    del installed["outside"]
+    vars(CLUSTERS).pop("_installed")
+    assert refusal().startswith("cluster: expected local, since no part of advsearch or of another package that opens")

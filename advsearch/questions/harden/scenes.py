@@ -25,6 +25,7 @@ from advsearch.extend import (
     Progress,
     SceneDescription,
     assets,
+    errors,
     results,
     seeds,
     settings,
@@ -121,8 +122,11 @@ class SceneJobs:
         # each job is a batch by itself
         for batch in executor.compute([job] for job in jobs):
             (job,) = batch.items
-            job_name = f"harden, scene {job.keywords['number']}"
-            (value,) = batch.require_value(job_name)
+            if batch.failure_reason:
+                raise errors.ClusterError(
+                    f"harden, scene {job.keywords['number']}: {batch.failure_reason}"
+                )
+            (value,) = batch.value
             worker_counts: dict[str, float | str] = {}
             if executor.stats is not None:
                 worker_counts = executor.stats.progress_counts
