@@ -126,7 +126,7 @@ def test_its_names_are_listed_and_its_parts_work_together(installed: Path, tmp_p
     sweep = ["sweep", *given, "--grid", "fade.amount=0,0.4,1", "--trials", "0", "--run", str(tmp_path / "sweep")]
     wide = [*(word.replace("fading", "fading={tolerance: 2}") for word in sweep), "--overwrite"]
     picture = ["render", *given, "--control", "fade={amount: 0.4}", "--out", str(tmp_path / "mug.png")]
-    exposed = ["attack", "--object", "mug", "--model", "zoo:tiny", "--label", "bowl", "--run", str(tmp_path / "exposed")]
+    exposed = ["attack", "--object", "mug", "--model", "zoo:tiny", "--label", "bowl", "--run", str(tmp_path / "lit")]
     exposed += ["--control", "camera={azimuth: 40, elevation: 25, roll: 0, sizes: 2.4, exposure: [-2, 2]}"]
     exposed += ["--steps", "6", "--trials", "6", "--resolution", "32", "--no-baseline", "--verify-spp", "16", *small]
     listed, summary, found, swept, widely, rendered, lit = advsearch(
