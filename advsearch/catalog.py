@@ -289,7 +289,7 @@ BUILT_INS = (
     BuiltIn(
         "policy",
         "adam",
-        f"{_POLICIES}.pgd:Adam",
+        f"{_POLICIES}.adam:Adam",
         "Adam (Kingma and Ba 2015) as ascent, projected onto the domain after each step",
     ),
     BuiltIn(
@@ -337,7 +337,7 @@ BUILT_INS = (
     BuiltIn(
         "policy",
         "portfolio",
-        f"{_POLICIES}.auto:Portfolio",
+        f"{_POLICIES}.portfolio:Portfolio",
         "runs several policies in parallel, and continues with the most successful ones",
     ),
     BuiltIn(
@@ -350,14 +350,14 @@ BUILT_INS = (
     BuiltIn(
         "policy",
         "restarts",
-        f"{_POLICIES}.auto:Restarts",
+        f"{_POLICIES}.restarts:Restarts",
         "runs a policy `times` times, each with an equal part of the renders; the runs "
         "alternate step by step",
     ),
     BuiltIn(
         "policy",
         "sobol",
-        f"{_POLICIES}.sampling:Sobol",
+        f"{_POLICIES}.sobol:Sobol",
         "a scrambled Sobol sequence over the full domain (Sobol 1967; scrambling of Owen "
         "1998, Matousek 1998)",
     ),

@@ -15,8 +15,8 @@ from test_architecture import ROOT, imports, python_files
 
 CORE = {
     "experiment": {"attack", "sweep", "render"},
-    "control": {"pose", "camera", "texture", "material", "light", "environment", "backdrop", "geometry"},
-    "policy": {"auto", "cmaes", "nes", "grid", "random", "sobol", "pgd", "adam", "portfolio", "restarts"},
+    "control": {"pose", "camera", "texture", "material", "light", "environment", "geometry"},
+    "policy": {"auto", "cmaes", "nes", "grid", "random", "pgd"},
     "task": {"classification", "detection"},
     "model source": set[str](),
     "recognizer": set[str](),

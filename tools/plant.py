@@ -214,7 +214,7 @@ FAULTS = (
     ),
     Fault(
         "policies: a mean keeps its bias",
-        "advsearch/attacks/policies/pgd.py",
+        "advsearch/attacks/policies/adam.py",
         "mean = state.direction / (1.0 - self.beta1**state.n_updates)",
         "mean = state.direction",
         ("tests/attacks/policies/test_policy_adam.py",),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from advsearch.attacks.domain import Block, Domain
 from advsearch.attacks.evaluation import (
     Evaluate,
@@ -16,11 +18,11 @@ from advsearch.attacks.evaluation import (
 from advsearch.attacks.objective_functions import margin
 from advsearch.attacks.objectives import OBJECTIVES, Objective, get_objective
 from advsearch.attacks.policies import POLICIES, make_policy
-from advsearch.attacks.policies.auto import Auto, Portfolio, Restarts
+from advsearch.attacks.policies.auto import Auto
 from advsearch.attacks.policies.choices import Choices
 from advsearch.attacks.policies.evolution import CMAES, NES
-from advsearch.attacks.policies.pgd import PGD, Adam
-from advsearch.attacks.policies.sampling import Grid, Random, Sobol
+from advsearch.attacks.policies.pgd import PGD
+from advsearch.attacks.policies.sampling import Grid, Random
 from advsearch.attacks.search import (
     SearchResult,
     StepRecord,
@@ -35,7 +37,14 @@ from advsearch.attacks.verification import (
     run_trials,
     verify,
 )
+from advsearch.registry import get_class
 from advsearch.statistics.intervals import clopper_pearson
+
+
+def __getattr__(name: str) -> Any:
+    """Import the class of a policy on first use: Adam, Sobol and other islands."""
+    return get_class("policy", name)
+
 
 __all__ = [
     "CMAES",
@@ -43,7 +52,6 @@ __all__ = [
     "OBJECTIVES",
     "PGD",
     "POLICIES",
-    "Adam",
     "Auto",
     "Block",
     "Choices",
@@ -55,14 +63,11 @@ __all__ = [
     "Grid",
     "Objective",
     "Policy",
-    "Portfolio",
     "Proposal",
     "Query",
     "Random",
-    "Restarts",
     "SampleCount",
     "SearchResult",
-    "Sobol",
     "StepRecord",
     "TrialCounts",
     "Verification",

@@ -42,6 +42,7 @@ CONTROLS: Registry[type[Control]] = Registry(
 
 "package.module:Class" is looked up too. A class is imported when it is looked up.
 """
+BACKDROP = "backdrop"  # the control that chooses among the photographs of a folder
 
 
 def make_control(
@@ -469,11 +470,12 @@ def _check_photograph_is_chosen(
 ) -> None:
     """Raise InputError if no control chooses among the photographs of a folder."""
     folder = scene.photographs
-    if folder is not None and "backdrop" not in {control.kind for control in controls}:
-        raise InputError(
-            f"backdrop: {folder.path} is a folder of photographs; "
-            "name one of them, or let the control backdrop choose, as in `over=backdrop`"
-        )
+    if folder is None or BACKDROP in {control.kind for control in controls}:
+        return
+    advice = "name one of them"
+    if BACKDROP in CONTROLS:
+        advice += f", or let the control {BACKDROP} choose, as in `over={BACKDROP}`"
+    raise InputError(f"backdrop: {folder.path} is a folder of photographs; {advice}")
 
 
 def _check_controls_in_photograph(controls: Sequence[Control], spec: str) -> None:

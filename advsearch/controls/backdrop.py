@@ -21,23 +21,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Control, Values
-from advsearch.controls.ranges import ParameterValue, list_allowed_names
-from advsearch.controls.support.images import rotate_map
-from advsearch.errors import InputError
-from advsearch.scene.assembly import PHOTOGRAPH_INPUT
-from advsearch.scene.assets import EnvironmentAsset, Float64Array
-from advsearch.scene.backdrop import has_plane
-from advsearch.scene.camera_model import CameraModel, make_pinhole
-from advsearch.scene.description import (
-    SCENE_ENVIRONMENT,
-    PhotographFolder,
+from advsearch.extend import (
+    Control,
+    InputError,
+    Parameter,
     SceneDescription,
+    Values,
+    assets,
+    geometry,
+    images,
+    parts,
+    reading,
 )
-from advsearch.scene.geometry import camera_to_world, compute_object_to_world
-from advsearch.scene.scene_data import cache_per_scene
-from advsearch.scene.settings import Parameter
 
+# option as long as the photographs of the scene are not known
+NO_PHOTOGRAPH = "own"
 # largest difference between the vertical direction and (0, 0, 1), per component
 PLANE_TOLERANCE = 1e-3
 # settings of the plane that must be the same in all photographs of a scene
@@ -51,8 +49,8 @@ class BackdropControl(Control):
     parameters = (
         Parameter.named(
             "which",
-            (SCENE_ENVIRONMENT,),
-            SCENE_ENVIRONMENT,
+            (NO_PHOTOGRAPH,),
+            NO_PHOTOGRAPH,
             "The photograph, by the name of its file.",
         ),
     )
@@ -61,10 +59,10 @@ class BackdropControl(Control):
     def declare_parameters(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
         """Return the parameter `which`, with the photographs in the settings as options.
 
-        See `list_allowed_names` for the forms of the setting.
+        See `Control.list_allowed_names` for the forms of the setting.
         """
         which = cls.parameters[0]
-        options = tuple(dict.fromkeys(list_allowed_names(settings, "which")))
+        options = tuple(dict.fromkeys(cls.list_allowed_names(settings, "which")))
         if not options:
             return (which,)
         # The value of a choice among names is the index of an option.
@@ -90,7 +88,7 @@ class BackdropControl(Control):
                 f"`controls` {self.name}: chooses among the photographs of a folder, "
                 "and the scene has none; set `backdrop=FOLDER`"
             )
-        views = self._select_views(scene, folder)
+        views = self._select_views(scene, folder.path, folder.scenes)
         self._check_views(views)
         first = next(iter(views.values()))
         # The scene shows the first photograph of the folder. If that is not allowed, it
@@ -102,21 +100,29 @@ class BackdropControl(Control):
         return replace(scene, camera_model=camera_model, photographs=photographs)
 
     def _select_views(
-        self, scene: SceneDescription, folder: PhotographFolder
+        self,
+        scene: SceneDescription,
+        folder: str,
+        views: Mapping[str, SceneDescription],
     ) -> dict[str, SceneDescription]:
         """Return the scene in each allowed photograph, by the photograph's name.
+
+        Args:
+            scene: scene that is rendered into a folder of photographs.
+            folder: path of the folder, for messages.
+            views: scene in each photograph of the folder, by name.
 
         Raises:
             InputError: a name is none of the photographs.
         """
-        allowed = [str(name) for name in self._list_names(scene)]
+        allowed = self._list_names(scene)
         for name in allowed:
-            if name not in folder.scenes:
+            if name not in views:
                 raise InputError(
-                    f"{self.name}.which: {folder.path} has no photograph "
-                    f"{name}; it has {', '.join(folder.scenes)[:200]}"
+                    f"{self.name}.which: {folder} has no photograph "
+                    f"{name}; it has {', '.join(views)[:200]}"
                 )
-        return {name: folder.scenes[name] for name in allowed}
+        return {name: views[name] for name in allowed}
 
     def _check_views(self, views: Mapping[str, SceneDescription]) -> None:
         """Raise InputError if the photographs can't all be shown in one scene.
@@ -136,11 +142,12 @@ class BackdropControl(Control):
                 )
             _check_compatible(name, view, first)
 
-    def _list_names(self, scene: SceneDescription) -> tuple[ParameterValue, ...]:
+    def _list_names(self, scene: SceneDescription) -> tuple[str, ...]:
         """Return the names of the photographs that may be chosen."""
         if scene.photographs is None:
             return ()
-        return self.list_allowed_values("which", *scene.photographs.scenes)
+        names = self.list_allowed_values("which", *scene.photographs.scenes)
+        return tuple(map(str, names))
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return the parameter with the photographs as options, the first as default.
@@ -148,7 +155,7 @@ class BackdropControl(Control):
         Without a setting of the user all of them are searched.
         """
         # `prepare` has checked that at least one photograph is allowed.
-        options = tuple(map(str, self._list_names(self.scene)))
+        options = self._list_names(self.scene)
         last_index = float(len(options) - 1)
         return replace(
             parameter,
@@ -170,7 +177,9 @@ class BackdropControl(Control):
         }
 
 
-def _find_shared_model(views: Mapping[str, SceneDescription]) -> CameraModel | None:
+def _find_shared_model(
+    views: Mapping[str, SceneDescription],
+) -> geometry.CameraModel | None:
     """Return the camera model of a scene in photographs; None if none needs a model.
 
     Args:
@@ -183,7 +192,7 @@ def _find_shared_model(views: Mapping[str, SceneDescription]) -> CameraModel | N
     return _get_lens(first) if has_model else None
 
 
-@cache_per_scene
+@geometry.cache_per_scene
 def _compute_view_inputs(scene: SceneDescription, index: int) -> dict[str, Tensor]:
     """Return the scene inputs that replace the first photograph by another one.
 
@@ -197,16 +206,16 @@ def _compute_view_inputs(scene: SceneDescription, index: int) -> dict[str, Tenso
     assert scene.photographs is not None
     view = list(scene.photographs.scenes.values())[index]
     view_to_scene = _compute_view_to_first(view, scene)
-    pose = view_to_scene @ camera_to_world(view)
+    pose = view_to_scene @ geometry.camera_to_world(view)
     # A gain is the factor of an exposure; the input is in stops, relative to the scene.
     exposure_stops = math.log2(view.gain / scene.gain)
     inputs = {
-        PHOTOGRAPH_INPUT: torch.tensor(float(index)),
+        parts.PHOTOGRAPH_INPUT: torch.tensor(float(index)),
         "camera.to_world": torch.from_numpy(pose).float(),
         "camera.exposure": torch.tensor(exposure_stops),
         **_compute_lens_input(scene, view),
     }
-    if has_plane(scene):
+    if reading.backdrop.has_plane(scene):
         inputs["ground.to_world"] = _compute_plane_pose(view, view_to_scene)
     if scene.environment is not None:
         inputs["environment.data"] = _turn_environment(scene.environment, view_to_scene)
@@ -235,7 +244,7 @@ def _move_into_photograph(
 
 
 def _turn_environment(
-    environment: EnvironmentAsset, view_to_scene: Float64Array
+    environment: assets.EnvironmentAsset, view_to_scene: assets.Float64Array
 ) -> Tensor:
     """Return the map (h, w, 3) of an environment, turned with a photograph's world.
 
@@ -250,12 +259,12 @@ def _turn_environment(
     # angle, counter-clockwise seen from above.
     angle = math.atan2(view_to_scene[1, 0], view_to_scene[0, 0])
     degrees = torch.tensor(math.degrees(angle))
-    return rotate_map(radiance, degrees)
+    return images.rotate_map(radiance, degrees)
 
 
 def _compute_view_to_first(
     view: SceneDescription, first: SceneDescription
-) -> Float64Array:
+) -> assets.Float64Array:
     """Return the map (4, 4) from the world of one photograph to that of the first.
 
     It maps the object's pose in the one to its pose in the other.
@@ -264,13 +273,15 @@ def _compute_view_to_first(
         view: scene in one photograph.
         first: scene in the first photograph.
     """
-    view_to_first: Float64Array = compute_object_to_world(first) @ np.linalg.inv(
-        compute_object_to_world(view)
-    )
+    pose = geometry.compute_object_to_world(view)
+    pose_in_first = geometry.compute_object_to_world(first)
+    view_to_first: assets.Float64Array = pose_in_first @ np.linalg.inv(pose)
     return view_to_first
 
 
-def _compute_plane_pose(view: SceneDescription, view_to_first: Float64Array) -> Tensor:
+def _compute_plane_pose(
+    view: SceneDescription, view_to_first: assets.Float64Array
+) -> Tensor:
     """Return the pose (4, 4) of the ground plane of a photograph in the scene.
 
     Its mesh is a square with a side of 2 at height 0, so that it is scaled by half the
@@ -287,14 +298,14 @@ def _compute_plane_pose(view: SceneDescription, view_to_first: Float64Array) -> 
     return pose
 
 
-def _get_lens(view: SceneDescription) -> CameraModel:
+def _get_lens(view: SceneDescription) -> geometry.CameraModel:
     """Return the camera model of a photograph.
 
     Without one, it is the model of a pinhole with the photograph's field of view.
     """
     if view.camera_model is not None:
         return view.camera_model
-    return make_pinhole(view.get_number("camera.fov"), view.aspect)
+    return geometry.make_pinhole(view.get_number("camera.fov"), view.aspect)
 
 
 def _check_compatible(
@@ -332,7 +343,7 @@ def _describe_difference(view: SceneDescription, first: SceneDescription) -> str
     is_upright = up_error <= PLANE_TOLERANCE
     if not is_upright:
         return "the object stands on another side"
-    if has_plane(view) != has_plane(first):
+    if reading.backdrop.has_plane(view) != reading.backdrop.has_plane(first):
         return "the camera is on another side of the plane, or its size differs,"
     if not _has_same_surface(view, first):
         return f"the plane has another size or gloss ({', '.join(PLANE_SURFACE)})"

@@ -502,6 +502,25 @@ class Control:
         """
         return cls.parameters
 
+    @staticmethod
+    def list_allowed_names(settings: object, parameter: str) -> list[str]:
+        """Return the names that settings allow for a parameter, for `declare_parameters`.
+
+        A parameter may be set to a name, a list of names, or {"choices": [...]}. Values
+        that are no strings are left out.
+
+        Args:
+            settings: settings of a control; if they are no mapping, the result is empty.
+            parameter: name of the parameter.
+        """
+        setting = settings.get(parameter) if isinstance(settings, Mapping) else None
+        if isinstance(setting, Mapping):
+            setting = setting.get("choices")
+        names: Sequence[object] = [setting]
+        if isinstance(setting, Sequence) and not isinstance(setting, str):
+            names = setting
+        return [name for name in names if isinstance(name, str)]
+
     def check_choices(self) -> None:
         """Check the values of the choices together; they are in `self.choice_values`.
 

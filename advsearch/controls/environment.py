@@ -23,12 +23,7 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import FULL_RANGE, Budget, Choice, Control, Values
-from advsearch.controls.ranges import (
-    Fixed,
-    ParameterValue,
-    Range,
-    list_allowed_names,
-)
+from advsearch.controls.ranges import Fixed, ParameterValue, Range
 from advsearch.controls.support.images import rotate_map
 from advsearch.errors import InputError
 from advsearch.scene import library, settings
@@ -107,7 +102,7 @@ class EnvironmentControl(Control):
         which, *others = cls.parameters
         files = [
             name
-            for name in list_allowed_names(settings, "which")
+            for name in cls.list_allowed_names(settings, "which")
             if name not in which.options and is_path(name)
         ]
         options = tuple(dict.fromkeys((*which.options, *files)))

@@ -204,25 +204,6 @@ def to_plain_value(value: object) -> object:
     return value
 
 
-def list_allowed_names(settings: object, parameter: str) -> list[str]:
-    """Return the names that the settings of a control allow for a parameter.
-
-    A parameter may be set to a name, a list of names, or {"choices": [...]}. Values
-    that are no strings are left out.
-
-    Args:
-        settings: settings of a control; if they are no mapping, the result is empty.
-        parameter: name of the parameter.
-    """
-    setting = settings.get(parameter) if isinstance(settings, Mapping) else None
-    if isinstance(setting, Mapping):
-        setting = setting.get("choices")
-    names: Sequence[object] = [setting]
-    if isinstance(setting, Sequence) and not isinstance(setting, str):
-        names = setting
-    return [name for name in names if isinstance(name, str)]
-
-
 def parse_spec(label: str, parameter: Parameter, setting: object) -> Spec:
     """Parse the setting of a parameter.
 

@@ -33,9 +33,14 @@ from advsearch.scene.geometry import (
     project_points,
 )
 from advsearch.scene.gradients import Group
-from advsearch.scene.parts import CAMERA, BeamLamp, LampGlass, MeshPart
+from advsearch.scene.parts import (
+    CAMERA,
+    PHOTOGRAPH_INPUT,
+    BeamLamp,
+    LampGlass,
+    MeshPart,
+)
 
-PHOTOGRAPH_INPUT = "backdrop.which"  # () index of the photograph of a folder
 PLANE_INPUT = "backdrop.plane"
 # inputs that the renderer applies to radiance
 IMAGE_INPUTS = frozenset(

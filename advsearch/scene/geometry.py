@@ -31,6 +31,7 @@ from torch import Tensor
 
 from advsearch.scene.assets import Float64Array, make_pose
 from advsearch.scene.camera_model import CameraModel as CameraModel
+from advsearch.scene.camera_model import make_pinhole as make_pinhole
 from advsearch.scene.parts import CAMERA, BeamLamp, Footprint, Lamp, ScenePart
 from advsearch.scene.poses import apply_settings as apply_settings
 from advsearch.scene.poses import compute_base_vertices as compute_base_vertices

@@ -32,6 +32,8 @@ from advsearch.scene.places.schema import PlaceFile
 Triple = tuple[float, float, float]
 # the type that stands for the texture in a surface in Mitsuba's words
 BASE_COLOR = "base color"
+# name of the input () that is the index of the photograph of a folder
+PHOTOGRAPH_INPUT = "backdrop.which"
 
 
 def iterate_plugins(plugin: Mapping[str, object]) -> Iterator[Mapping[str, object]]:

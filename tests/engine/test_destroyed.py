@@ -304,7 +304,7 @@ UNTOUCHED: dict[Any, set[str]] = {
     NumberControl: {
         *(
             "declare_parameters", "get_setting_name", "to_settings", "select_form", "get_mesh", "with_scene",
-            "list_allowed_values", "is_searched", "resolve_parameter",
+            "list_allowed_values", "list_allowed_names", "is_searched", "resolve_parameter",
         ),
         *(
             "get_clean_value", "get_value_without_control", "get_parameter_spec", "get_budget",

@@ -13,7 +13,7 @@ from PIL import Image
 
 import advsearch
 import samples
-from advsearch.controls import make_space
+from advsearch.controls import CONTROLS, make_space
 from advsearch.controls.backdrop import BackdropControl
 from advsearch.engine.loading import fit_camera, make_controls
 from advsearch.errors import FileFormatError, InputError
@@ -115,6 +115,16 @@ def test_a_folder_needs_the_control_and_the_control_a_folder(folder: Path) -> No
     with pytest.raises(InputError, match="a mask belongs to one photograph"):
         advsearch.load_scene(BOX, backdrop=folder, unit="mm", occluder="mask.png")
     assert BackdropControl().to_settings() == {}
+
+
+def test_without_the_control_a_folder_is_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    others = {name: part for name, part in CONTROLS.built_ins.items() if name != "backdrop"}
+    monkeypatch.setattr(CONTROLS, "built_ins", others)
+    scene = advsearch.load_scene(BOX, backdrop=folder, unit="mm")
+    with pytest.raises(InputError, match=r"is a folder of photographs; name one of them$"):
+        scene.renderer("texture", resolution=96)
+    with pytest.raises(InputError, match="unknown control 'backdrop'"):
+        scene.renderer("backdrop", resolution=96)
 
 
 def test_photographs_that_can_not_be_chosen_among_are_named(tmp_path: Path) -> None:

@@ -27,11 +27,23 @@ from advsearch.attacks.evaluation import (
     limit_to_single_thread,
     seeded,
 )
-from advsearch.attacks.policies.auto import Auto, Portfolio, Restarts, WithoutAscent
-from advsearch.attacks.policies.choices import Choices
+from advsearch.attacks.policies.auto import Auto, WithoutAscent
+from advsearch.attacks.policies.choices import (
+    Choices,
+    Race,
+    RacingPolicy,
+    start_race,
+    wrap_choices,
+)
 from advsearch.attacks.policies.evolution import CMAES, NES
-from advsearch.attacks.policies.pgd import PGD, Adam
-from advsearch.attacks.policies.sampling import Grid, Random, Sobol
+from advsearch.attacks.policies.pgd import NO_SQUARES, PGD, Ascent, AscentPolicy
+from advsearch.attacks.policies.sampling import (
+    Grid,
+    NonAdaptivePolicy,
+    PointsState,
+    Random,
+    to_domain,
+)
 from advsearch.attacks.policies.surrogate import (
     MAX_SCALED_DIM,
     Observations,
@@ -41,7 +53,7 @@ from advsearch.attacks.policies.surrogate import (
 from advsearch.catalog import list_built_ins
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import check_options
-from advsearch.registry import Registry
+from advsearch.registry import Registry, get_class
 
 POLICIES: Registry[type[Policy[Any]]] = Registry(
     "advsearch.policies",
@@ -113,13 +125,20 @@ def _make_nested_policy(spec: Spec, where: str) -> Policy[Any]:
     return make_policy(str(spec["name"]), **options)
 
 
+def __getattr__(name: str) -> Any:
+    """Import the class of a policy on first use: Adam, Sobol and other islands."""
+    return get_class("policy", name)
+
+
 __all__ = [
     "CMAES",
     "MAX_SCALED_DIM",
     "NES",
+    "NO_SQUARES",
     "PGD",
     "POLICIES",
-    "Adam",
+    "Ascent",
+    "AscentPolicy",
     "Auto",
     "Choices",
     "Domain",
@@ -128,13 +147,14 @@ __all__ = [
     "Failures",
     "FoundFailure",
     "Grid",
+    "NonAdaptivePolicy",
     "Observations",
+    "PointsState",
     "Policy",
-    "Portfolio",
     "Proposal",
+    "Race",
+    "RacingPolicy",
     "Random",
-    "Restarts",
-    "Sobol",
     "Spec",
     "Surrogate",
     "WithoutAscent",
@@ -148,4 +168,7 @@ __all__ = [
     "option_center",
     "seeded",
     "select_diverse",
+    "start_race",
+    "to_domain",
+    "wrap_choices",
 ]

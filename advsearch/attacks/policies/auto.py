@@ -1,15 +1,14 @@
-"""The policy to use first, and policies that wrap others.
+"""The policy to use first.
 
-`Auto` explores the domain evenly, then searches where a surrogate of the objective is
-promising, then follows the gradient. `Restarts` runs one policy from several starts,
-and `Portfolio` several policies on one budget.
+It explores the domain evenly, then searches where a surrogate of the objective is
+promising, then follows the gradient.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -26,13 +25,6 @@ from advsearch.attacks.evaluation import (
     limit_to_single_thread,
     seeded,
 )
-from advsearch.attacks.policies.choices import (
-    Race,
-    RacingPolicy,
-    start_race,
-    wrap_choices,
-)
-from advsearch.attacks.policies.evolution import CMAES
 from advsearch.attacks.policies.pgd import PGD, Ascent
 from advsearch.attacks.policies.surrogate import (
     BoxCoordinates,
@@ -40,7 +32,6 @@ from advsearch.attacks.policies.surrogate import (
     Surrogate,
     find_box_coordinates,
 )
-from advsearch.errors import InputError
 
 # Fraction of the renders that the screen takes. The screen are evenly spread points
 # that are evaluated first. "Mixed" domains have norm balls besides box coordinates.
@@ -544,142 +535,3 @@ class WithoutAscent(Auto):
 
     def takes_differences(self, domain: Domain, steps: int) -> bool:
         return False
-
-
-@dataclass(frozen=True)
-class Restarts(RacingPolicy[Race]):
-    """Runs a policy `times` times, each with an equal fraction of the renders.
-
-    The runs take turns, step by step. The first begins where the policy would begin by
-    itself, the others at samples of the domain (`Domain.sample`); norm balls stay
-    around the start. A run that has nothing more to propose leaves its renders to the
-    others. This is for an objective with several peaks, of which a gradient finds the
-    nearest. Discrete choices are fixed outside (`Choices`), so every combination of
-    options has its own restarts.
-
-    Attributes:
-        policy: policy that searches; in `make_policy` a name, or a mapping with a name
-            and options.
-        times: number of runs, at least 1. There are fewer if the renders do not suffice
-            for one evaluation each.
-    """
-
-    policy: Policy[Any] = field(default_factory=PGD)
-    times: int = 4
-
-    name: ClassVar[str] = "restarts"
-
-    def __post_init__(self) -> None:
-        """Check that the policy is one, and the number of restarts."""
-        if not isinstance(self.policy, Policy):
-            raise InputError(
-                "policy of restarts: expected a policy, got "
-                f"{self.policy!r}; use make_policy for names"
-            )
-        if self.times < 1:
-            raise InputError(f"times: expected at least 1, got {self.times}")
-
-    @property
-    def uses_gradient(self) -> bool:
-        return self.policy.uses_gradient
-
-    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Race:
-        """Start the policy from several points; the first is the domain's own.
-
-        There are at most `times` starts, and so few that the renders (`steps`) allow
-        each at least one evaluation with its gradient.
-        """
-        seed = draw_seed(generator)
-        initial_points = [domain.initial_point]
-        for number in range(1, self._count_starts(domain, steps)):
-            initial_points.append(domain.sample(seeded(seed, number))[0])
-        searches = [
-            (self.policy, replace(domain, restart_point=point))
-            for point in initial_points
-        ]
-        # With a single round, no search is dropped before the end.
-        return start_race(searches, steps, seed, rounds=1)
-
-    def _count_starts(self, domain: Domain, steps: int) -> int:
-        """Return how many searches there are, of which each can be evaluated."""
-        renders_per_evaluation = 1
-        if self.policy.uses_gradient:
-            renders_per_evaluation += domain.gradient_cost
-        return max(1, min(self.times, steps // renders_per_evaluation))
-
-
-@dataclass(frozen=True)
-class Portfolio(RacingPolicy[Race]):
-    """Runs several policies in parallel and continues with the better ones.
-
-    With n policies there are 1 + ceil(log2 n) rounds of equally many renders, see
-    `choices`. In a round, its renders are divided equally among the policies that are
-    left. After it the better half continues, by the largest objective so far. So with
-    two policies each gets a quarter of the renders, and the better one the other half.
-
-    A policy that cannot search the domain, for example a grid over a texture, raises an
-    InputError when it starts. It is left out. If no policy can search the domain, the
-    error of the first one is raised.
-
-    Attributes:
-        policies: at least one policy; in `make_policy` a list of names, or of mappings
-            with a name and options.
-    """
-
-    policies: tuple[Policy[Any], ...] = (Auto(), CMAES())
-
-    name: ClassVar[str] = "portfolio"
-    handles_choices: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        """Check that the policies are policies, and that there is one."""
-        object.__setattr__(self, "policies", tuple(self.policies))
-        if not self.policies or not all(
-            isinstance(policy, Policy) for policy in self.policies
-        ):
-            raise InputError(
-                "policies of portfolio: expected one policy or more, got "
-                f"{self.policies!r}"
-            )
-
-    @property
-    def uses_gradient(self) -> bool:
-        return any(policy.uses_gradient for policy in self.policies)
-
-    def takes_differences(self, domain: Domain, steps: int) -> bool:
-        return any(policy.takes_differences(domain, steps) for policy in self.policies)
-
-    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Race:
-        """Start a race of the policies that can search the domain.
-
-        Raises:
-            InputError: none of them can; it is the error of the first.
-        """
-        seed = draw_seed(generator)
-        policies = self._find_suitable_policies(domain, seed, steps)
-        return start_race([(policy, domain) for policy in policies], steps, seed)
-
-    def _find_suitable_policies(
-        self, domain: Domain, seed: int, steps: int
-    ) -> list[Policy[Any]]:
-        """Return the policies that can search the domain, at least one.
-
-        Raises:
-            InputError: none of them can; it is the error of the first.
-        """
-        steps_each = max(1, steps // len(self.policies))
-        suitable = []
-        errors = []
-        for policy in self.policies:
-            wrapped = wrap_choices(policy, domain)
-            try:
-                # This only tests whether the policy can search the domain. The race
-                # starts it again, when the number of searches is known.
-                wrapped.start(domain, seeded(seed, 0), steps_each)
-            except InputError as error:
-                errors.append(error)
-            else:
-                suitable.append(wrapped)
-        if not suitable:
-            raise errors[0]
-        return suitable

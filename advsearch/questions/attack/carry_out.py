@@ -28,7 +28,7 @@ from advsearch.attacks.policies import POLICIES
 from advsearch.cluster import BatchFunction, Workers, WorkerTask
 from advsearch.cluster.workers import open_workers
 from advsearch.config import SceneConfig, has_model_url, make_single_value_error
-from advsearch.controls import Space, make_space
+from advsearch.controls import BACKDROP, Space, make_space
 from advsearch.controls.base import Control, describe_adjusted_defaults
 from advsearch.controls.ranges import has_distribution
 from advsearch.engine import judging, loading, naming
@@ -262,7 +262,7 @@ def _replace_scene(
     random_controls = tuple(
         control
         for control in parts.random_controls
-        if not control.photograph_refusal and control.kind != "backdrop"
+        if not control.photograph_refusal and control.kind != BACKDROP
     )
     return replace(
         parts,

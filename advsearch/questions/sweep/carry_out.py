@@ -16,7 +16,7 @@ from advsearch.api.keywords import (
 )
 from advsearch.calls import drop_unset
 from advsearch.cluster import BatchFunction
-from advsearch.controls import Control
+from advsearch.controls import BACKDROP, Control
 from advsearch.controls.camera import CameraControl, adapt_length_unit
 from advsearch.engine import judging, loading, naming
 from advsearch.engine.journal import check_digests, make_worker_call
@@ -93,7 +93,6 @@ SCENE_SETTINGS = (
 )
 """Settings that describe a scene. If the caller passed a loaded scene, it has them."""
 WORKER = "advsearch.questions.sweep.carry_out:sweep_worker"
-BACKDROP = "backdrop"  # the control that draws a photograph
 # name of the scene without the adversarial configuration of a run
 CLEAN = "clean"
 AnyScene = Scene | str | Path

@@ -13,6 +13,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from advsearch import attacks
 from advsearch.attacks import (
     PGD,
     POLICIES,
@@ -25,10 +26,12 @@ from advsearch.attacks import (
     Query,
     get_objective,
     make_policy,
+    policies,
     search,
 )
 from advsearch.attacks.evaluation import seeded
 from advsearch.attacks.objectives import OBJECTIVES
+from advsearch.catalog import list_built_ins
 from advsearch.errors import InputError
 from covering import once_each
 
@@ -233,6 +236,14 @@ def label(policy: Any) -> str | None:
     if not isinstance(policy, Policy):
         return None
     return policy.name if policy == make_policy(policy.name) else f"{policy.name} with options"
+
+
+def test_the_classes_of_all_policies_are_offered_by_their_packages() -> None:
+    for part in list_built_ins("policy").values():
+        name = part.import_path.rpartition(":")[2]
+        assert getattr(attacks, name) is getattr(policies, name) is POLICIES[part.name]
+    with pytest.raises(AttributeError, match="no policy with a class Annealing"):
+        attacks.Annealing  # noqa: B018
 
 
 battery = pytest.mark.parametrize("policy", every_policy(), ids=label)
