@@ -60,3 +60,31 @@ def test_a_file_that_asks_for_very_many_threads_gets_a_few_for_each_core() -> No
         assert threads.configure(1024) == threads.MAX_THREADS_PER_CORE * threads.count_cores()
     finally:
         threads.configure()
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("photograph", [False, True])
+@pytest.mark.parametrize("control", ["light", "material", "texture", "spot"])
+def test_an_adjoint_does_not_depend_on_the_number_of_threads(control: str, photograph: bool, tmp_path: Path) -> None:
+    """It is added up by several threads: of small sums Dr.Jit has a copy for each, unless it is told otherwise."""
+    import torch
+    from PIL import Image
+
+    import advsearch
+
+    Image.new("RGB", (32, 32), (120, 160, 90)).save(tmp_path / "a.png")
+    scene = advsearch.load_scene("mug", backdrop=tmp_path / "a.png" if photograph else None)
+    render = scene.renderer(control, resolution=32, denoise="none")
+    adjoint = [group for group in render.plan.groups if group.estimator == "adjoint"]
+    gradients = []
+    try:
+        for count in (1, 2, 4):
+            threads.configure(count)
+            u = torch.full((len(render.start),), 0.4).requires_grad_()
+            (gradient,) = torch.autograd.grad(render(u, 1, 16).sum(), u)
+            gradients.append([float(gradient[group.coordinates].sum()) for group in adjoint])
+    finally:
+        threads.configure()
+    assert adjoint and all(gradients[0])
+    for gradient in gradients[1:]:
+        assert gradient == pytest.approx(gradients[0], rel=1e-3)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -44,6 +44,7 @@ from advsearch.scene.mitsuba_backend.transport import (
     find_first_hits,
 )
 from advsearch.scene.mitsuba_backend.variant import (
+    add_without_copies,
     Plugin,
     Recordings,
     dr,
@@ -645,14 +646,17 @@ class MitsubaScene:
             image_gradient: derivative of the loss by the channels of Mitsuba's image.
             seed, spp: as in `render_adjoint`.
         """
-        self._get_integrator(method).render_backward(
-            self._scene,
-            self.parameters,
-            mi.TensorXf(image_gradient),
-            sensor=self._sensor,
-            seed=seed,
-            spp=self.round_sample_count(spp),
-        )
+        # `PhotographPath` adds to the gradients of lamps before its loop and in it.
+        is_photograph = method == "hidden" and self.plane_radiance is not None
+        with add_without_copies() if is_photograph else nullcontext():
+            self._get_integrator(method).render_backward(
+                self._scene,
+                self.parameters,
+                mi.TensorXf(image_gradient),
+                sensor=self._sensor,
+                seed=seed,
+                spp=self.round_sample_count(spp),
+            )
 
     def _make_image_gradient(self, cotangent: Tensor) -> Tensor:
         """Return a cotangent with the channels of the image that Mitsuba renders.
