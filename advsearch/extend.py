@@ -1,5 +1,5 @@
 """The interface for extensions of advsearch: experiments, controls, tasks, policies,
-model sources, readers, exporters and clusters.
+model sources, readers, exporters, predictors and clusters.
 
     from advsearch.extend import Control, Parameter, Values
 

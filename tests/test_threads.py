@@ -76,15 +76,15 @@ def test_an_adjoint_does_not_depend_on_the_number_of_threads(control: str, photo
     scene = advsearch.load_scene("mug", backdrop=tmp_path / "a.png" if photograph else None)
     render = scene.renderer(control, resolution=32, denoise="none")
     adjoint = [group for group in render.plan.groups if group.estimator == "adjoint"]
-    gradients = []
+    sums = list[list[float]]()
     try:
         for count in (1, 2, 4):
             threads.configure(count)
             u = torch.full((len(render.start),), 0.4).requires_grad_()
             (gradient,) = torch.autograd.grad(render(u, 1, 16).sum(), u)
-            gradients.append([float(gradient[group.coordinates].sum()) for group in adjoint])
+            sums.append([float(gradient[group.coordinates].sum()) for group in adjoint])
     finally:
         threads.configure()
-    assert adjoint and all(gradients[0])
-    for gradient in gradients[1:]:
-        assert gradient == pytest.approx(gradients[0], rel=1e-3)
+    assert adjoint and all(sums[0])
+    for other in sums[1:]:
+        assert other == pytest.approx(sums[0], rel=1e-3)

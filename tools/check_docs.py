@@ -37,6 +37,7 @@ from advsearch.cli.show import REGISTRIES
 from advsearch.cluster.workers import CLUSTERS
 from advsearch.controls import CONTROLS, texture
 from advsearch.controls.support.norms import DEFAULT_EPSILON
+from advsearch.engine.prediction import PREDICTORS
 from advsearch.files import MESHES
 from advsearch.models import loading, reference
 from advsearch.models.loading import SOURCES as SOURCES_OF_MODELS
@@ -581,6 +582,7 @@ REGISTERED = (
     EXPORTERS,
     OBJECTIVE_KINDS,
     POLICIES,
+    PREDICTORS,
     READERS,
     SOURCES_OF_MODELS,
 )

@@ -4,7 +4,7 @@
 
     class Still(prediction.PredictionMethod):
         name = "still"
-        what_it_does = "those of the start"
+        pictures_are = "those of the start"
 
 `advsearch.extend` offers this module to added predictors. A method is a subclass of
 `PredictionMethod`; what it makes are a `PredictedSearch` for searches and a
@@ -43,7 +43,7 @@ from advsearch.scene.mitsuba_backend.variant import dr as dr
 from advsearch.scene.mitsuba_backend.variant import mi as mi
 from advsearch.scene.mitsuba_backend.variant import mitsuba_lock as mitsuba_lock
 from advsearch.scene.photographed_ground import (
-    compute_irradiance as compute_open_sky_irradiance,
+    compute_open_sky_irradiance as compute_open_sky_irradiance,
 )
 from advsearch.scene.predictor import MAX_BYTES as MAX_BYTES
 from advsearch.scene.predictor import NOISE as NOISE
@@ -65,5 +65,3 @@ from advsearch.scene.transport.matrix import (
     find_bilinear_weights as find_bilinear_weights,
 )
 from advsearch.scene.transport.matrix import to_torch_csr as to_torch_csr
-
-__all__ = ["compute_open_sky_irradiance"]

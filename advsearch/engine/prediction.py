@@ -11,6 +11,7 @@ Methods are parts of the catalog, and other packages may add some (`PREDICTORS`)
 
 from __future__ import annotations
 
+import inspect
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
@@ -84,8 +85,8 @@ class PredictedSearch(ABC):
         window: the window of the image that is traced; None for the full image.
     """
 
-    method: ClassVar[str] = "matrix"
-    title: ClassVar[str] = "collecting light transport"
+    method: ClassVar[str]
+    title: ClassVar[str]
     what_it_renders: ClassVar[str] = "renders nothing"
     is_exact: ClassVar[bool] = False
 
@@ -316,19 +317,19 @@ class SweepMethod(ABC):
 class PredictionMethod(ABC):
     """A method that predicts images in place of renders.
 
-    The methods of the registry are tried in its order, the cheapest first. They are
-    asked only if the setting `specialise` allows predictions, and if no image is
-    composed of several.
+    The methods of the registry are tried in its order, the cheapest first.
 
     Attributes:
-        name: name in the registry.
-        what_it_does: text that completes "pictures are ...".
-        follows_bounces: whether its images have the bounces of light of a render; else
-            they have all of them.
+        name: name in the registry. Reports have the `method` of a search, or the `name`
+            of a `SweepMethod`.
+        pictures_are: text that completes "pictures are ...", such as "predicted by
+            matrices".
+        follows_bounces: whether its images have only the bounces of light that the
+            search renders (`Problem.search_depth`); else they have all.
     """
 
     name: ClassVar[str]
-    what_it_does: ClassVar[str]
+    pictures_are: ClassVar[str]
     follows_bounces: ClassVar[bool] = True
 
     @abstractmethod
@@ -337,11 +338,12 @@ class PredictionMethod(ABC):
     ) -> Refusal | None:
         """Return why the images of a search are not predicted; None if they may be.
 
-        Whether predictions are accurate is measured later. A refusal with the cause
-        `NOTHING_MOVES` is never reported.
+        Called only if the setting `specialise` allows predictions. Whether they are
+        accurate is measured later. A refusal with the cause `NOTHING_MOVES` is never
+        reported.
 
         Args:
-            problem: problem of the search.
+            problem: problem of the search, whose images are not composed of several.
             steps: evaluations of the search.
             policy: policy by which it searches.
         """
@@ -411,7 +413,8 @@ PREDICTORS: Registry[type[PredictionMethod]] = Registry(
     lambda name, entry: (
         isinstance(entry, type)
         and issubclass(entry, PredictionMethod)
-        and entry.name == name
+        and not inspect.isabstract(entry)
+        and getattr(entry, "name", None) == name
     ),
 )
 """Every method by its name, the cheapest first, imported when it is used."""

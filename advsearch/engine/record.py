@@ -62,8 +62,8 @@ class RunState:
         interrupted: whether the run was interrupted.
         predictor: predictor of the images of the searches; None if they were rendered.
         predictor_refusal: why images were not predicted, or only cropped.
-        inaccuracy_refusal: why the first predictor that was tried was too inaccurate
-            surfaces, if that was tried.
+        inaccuracy_refusal: why the latest predictor that was tried was too inaccurate;
+            None if none was.
         crop_refusal: why full images were rendered.
         verification_renders: number of renders for trials, and for choosing their
             sample count.
@@ -111,8 +111,8 @@ class RunState:
             crop = str(self.crop_refusal) if self.crop_refusal else None
             return LinearTransport(used=False, reason=reason, crop=crop)
         summary = self.predictor.summarize()
-        # Why a better method was not used. Matrices are better than a crop, and light
-        # on surfaces is better than matrices.
+        # Why a better method was not used. Any predictor is better than a crop, and one
+        # that was tried before this one is cheaper.
         better_method_refusal = self.predictor_refusal or self.inaccuracy_refusal
         # If the predictor was given up, its summary has that as the reason, which
         # stays.

@@ -1,4 +1,4 @@
-"""Searches whose images are predicted, and their simplest predictor: a matrix.
+"""The simplest predictor: a matrix of light transport, or an image of each light.
 
 A matrix of light transport predicts the images of a search without random conditions.
 Every `COMPARISON_INTERVAL` evaluations predictions are compared with traced images. If
@@ -154,6 +154,8 @@ class Transport(PredictedSearch):
         clean_matrix: the matrix with which every search begins.
     """
 
+    method: ClassVar[str] = "matrix"
+    title: ClassVar[str] = "collecting light transport"
     is_exact: ClassVar[bool] = True
     clean_matrix: CleanMatrix = field(default_factory=CleanMatrix)
     # predicted score minus the lower end of the scores of trials (`update_score_bias`)
@@ -479,7 +481,7 @@ class MatrixMethod(PredictionMethod):
     """
 
     name = "matrix"
-    what_it_does = "predicted by a matrix"
+    pictures_are = "predicted by a matrix"
 
     def find_search_refusal(
         self, problem: Problem, steps: int, policy: Policy[Any]

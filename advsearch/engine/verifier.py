@@ -51,7 +51,7 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.runs.summary import read_configuration
 from advsearch.scene.color import round_to_8_bit
 from advsearch.scene.formation import round_sample_count
-from advsearch.scene.predictor import RefusalCause
+from advsearch.scene.predictor import Refusal, RefusalCause
 from advsearch.tasks import Judgement
 
 # The row of a trial has the values of its configuration if these are at most this many.
@@ -338,7 +338,7 @@ class Verifier:
         The trials vary some coordinates of a configuration. If a method can follow
         these, accurately enough and at less cost than rendering, the state gets it as
         `predictor`. Else the state gets the reason as `predictor_refusal`, unless the
-        method is for other coordinates.
+        method is for other coordinates. The number of samples is known by then.
 
         Args:
             u: (d,) the configuration.
@@ -346,29 +346,29 @@ class Verifier:
             n_images: about how many trials there are.
         """
         state = self.run_state
+        state.predictor = None
         for method in make_methods():
             refusal = method.find_trials_refusal(
                 self.problem, coordinates, state.spp, n_images
             )
             if refusal is None:
                 predictor = method.make_trials(self.problem, u, coordinates)
-                self._prepare_trials(predictor)
-            elif refusal.cause is not RefusalCause.NOTHING_MOVES:
-                state.predictor_refusal = refusal
-            if state.predictor is not None:
+                refusal = self._prepare_trials(predictor)
+            if refusal is None:
+                state.predictor = predictor
+                state.predictor_refusal = None
                 return
+            if refusal.cause is not RefusalCause.NOTHING_MOVES:
+                state.predictor_refusal = refusal
 
-    def _prepare_trials(self, predictor: PredictedSearch) -> None:
-        """Prepare a predictor of trials, and store it or why it is not used."""
+    def _prepare_trials(self, predictor: PredictedSearch) -> Refusal | None:
+        """Prepare a predictor of trials; return why it is too inaccurate, if it is."""
         stages = self.progress_stages
         hint = "`specialise=false` leaves it out"
         stages.begin("transport", predictor.title, predictor.preparation_spp, hint=hint)
         # It compares predicted images with traced ones, and may refuse.
         predictor.prepare(stages.progress.advance)
-        refusal = predictor.accuracy_refusal
-        self.run_state.predictor_refusal = refusal
-        if refusal is None:
-            self.run_state.predictor = predictor
+        return predictor.accuracy_refusal
 
     def try_configurations(
         self,

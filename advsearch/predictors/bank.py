@@ -11,7 +11,7 @@ import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -115,6 +115,9 @@ class Bank(prediction.PredictedSearch):
         gaps: for each comparison, the mean objective under conditions of the bank minus
             that under unseen conditions.
     """
+
+    method: ClassVar[str] = "matrix"
+    title: ClassVar[str] = "collecting light transport"
 
     collect_light: prediction.Evaluate
     draws_conditions: bool = field(default=True, kw_only=True)
@@ -548,7 +551,7 @@ class BankMethod(prediction.PredictionMethod):
     """Predicts searches with random conditions by a matrix for each of some of them."""
 
     name = "bank"
-    what_it_does = "predicted by matrices"
+    pictures_are = "predicted by matrices"
 
     def find_search_refusal(
         self, problem: Problem, steps: int, policy: Policy[Any]

@@ -16,7 +16,7 @@ from advsearch.scene import settings
 from advsearch.scene.assets import BoolArray, EnvironmentAsset, Float64Array
 from advsearch.scene.geometry import camera_to_world, compute_center
 from advsearch.scene.parts import MeshPart, Place
-from advsearch.scene.photographed_ground import compute_irradiance
+from advsearch.scene.photographed_ground import compute_open_sky_irradiance
 from advsearch.scene.places.place_file import load_bundled_place, make_place_parts
 from advsearch.scene.places.schema import PictureEntry
 from advsearch.scene.scene_data import AnyScene, SceneData
@@ -220,7 +220,9 @@ def _is_dark(environment: EnvironmentAsset | None) -> bool:
     if environment is None or environment.candelas is None:
         return False
     # of level ground, (3,)
-    irradiance = compute_irradiance(torch.from_numpy(environment.radiance.copy()))
+    irradiance = compute_open_sky_irradiance(
+        torch.from_numpy(environment.radiance.copy())
+    )
     weighted_irradiance = float(irradiance @ torch.tensor(LUMINANCE))
     # `candelas` is the luminance of a radiance of 1, cd/m2: the product is in lux.
     illuminance = environment.candelas * weighted_irradiance

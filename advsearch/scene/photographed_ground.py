@@ -130,7 +130,7 @@ class PhotographedGround:
             self._horizon_row, self._map_rows, device=radiance.device
         ) * ((rows - 1) / (self._map_rows - 1))
         lower_half = _interpolate_rows(radiance, map_row)
-        irradiance = compute_irradiance(radiance)
+        irradiance = compute_open_sky_irradiance(radiance)
         return torch.where(
             irradiance > 0.0, lower_half * math.pi / irradiance.clamp_min(1e-30), 0.0
         )
@@ -170,7 +170,7 @@ def get_photographed_ground(
     return PhotographedGround(environment.radiance, height, rotation)
 
 
-def compute_irradiance(radiance: Tensor) -> Tensor:
+def compute_open_sky_irradiance(radiance: Tensor) -> Tensor:
     """Return the irradiance (3,) of a map (H, W, 3) on unshadowed level ground.
 
     It is the integral of radiance times the cosine of the angle from straight up, over

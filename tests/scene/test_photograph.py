@@ -12,7 +12,7 @@ from advsearch.engine.loading import Scene, load_scene
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import load_description
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.photographed_ground import PhotographedGround, compute_irradiance
+from advsearch.scene.photographed_ground import PhotographedGround, compute_open_sky_irradiance
 
 SIZE = 32
 AWAY = {"pose.x": 900.0, "pose.scale": 0.01}
@@ -47,7 +47,7 @@ def from_the_tripod(height: float) -> Tensor:
 
 def test_a_floor_as_bright_as_the_light_is_white() -> None:
     flat = torch.full((16, 32, 3), 2.0)
-    assert torch.allclose(compute_irradiance(flat), torch.full((3,), 2.0 * math.pi), rtol=1e-3)
+    assert torch.allclose(compute_open_sky_irradiance(flat), torch.full((3,), 2.0 * math.pi), rtol=1e-3)
     photograph = PhotographedGround(flat.numpy(), 3.0, 0.0)
     assert torch.allclose(photograph.base_color, torch.ones_like(photograph.base_color), rtol=1e-3)
     finer = photograph.compute_reflectance(torch.full((64, 128, 3), 5.0))

@@ -19,7 +19,7 @@ from advsearch.scene.geometry import compute_base_vertices
 from advsearch.scene.glb import encode_glb
 from advsearch.scene.grounds import LUMINANCE, has_lanes, is_enclosed, is_paved
 from advsearch.scene.library import import_environment, load_environment
-from advsearch.scene.photographed_ground import compute_irradiance
+from advsearch.scene.photographed_ground import compute_open_sky_irradiance
 from advsearch.scene.places import place_meshes
 from advsearch.scene.places.place_file import load_bundled_place, read_place_file
 from glb_files import change_header
@@ -112,7 +112,7 @@ def test_a_street_of_ones_own_stands_around_the_object_to_scale(street: Path) ->
 def test_the_light_of_a_place_has_a_unit_and_its_lamps_shine_by_night(street: Path) -> None:
     day, night = load_description("car", street), load_description("car", f"{street}#night")
     lit = import_environment(street.parent / "sky.exr")
-    level = float(compute_irradiance(torch.from_numpy(lit.radiance.copy())) @ torch.tensor(LUMINANCE))
+    level = float(compute_open_sky_irradiance(torch.from_numpy(lit.radiance.copy())) @ torch.tensor(LUMINANCE))
     assert day.environment is not None and night.environment is not None
     assert day.environment.candelas == pytest.approx(20000.0 / level)
     assert day.surrounding_meshes["lamp"].emission is None

@@ -23,7 +23,7 @@ class SurfaceLightMethod(prediction.PredictionMethod):
     """Predicts images from many cameras by light that is stored on surfaces."""
 
     name = "surface_light"
-    what_it_does = "predicted by light on surfaces"
+    pictures_are = "predicted by light on surfaces"
     follows_bounces = False
 
     def find_search_refusal(

@@ -18,6 +18,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 import scipy.sparse
@@ -43,6 +44,10 @@ from advsearch.predictors.surface_light.view_rays import (
     ViewTracer,
     make_light_maps,
 )
+
+BoolArray: TypeAlias = assets.BoolArray
+Float32Array: TypeAlias = assets.Float32Array
+IntArray: TypeAlias = assets.IntArray
 
 
 class SurfaceView:
@@ -131,7 +136,7 @@ def _find_camera_samples(
 
 def _find_cell_weights(
     samples: ViewSamples, selected: slice, shape: tuple[int, int]
-) -> tuple[Ints, assets.Float32Array]:
+) -> tuple[Ints, Float32Array]:
     """Return the four cells of the fine grid that each sample reads, and their weights.
 
     Both are (n, 4). The cells of the back follow those of the front.
@@ -283,7 +288,7 @@ class Arrangement:
         object_lobes = [self._measure_object_lobes()] * self.n_sides
         return object_lobes + [Lobes.make_diffuse()] * n_grounds
 
-    def _lay_texels(self, seed: int) -> assets.Float32Array:
+    def _lay_texels(self, seed: int) -> Float32Array:
         """Lay texels over all surfaces, and find what they see of sky and each other.
 
         Returns:
@@ -291,7 +296,7 @@ class Arrangement:
         """
         vertices = self._get_object_buffer("vertices")
         normals = self._get_object_buffer("normals")
-        object_center: assets.Float32Array = 0.5 * (
+        object_center: Float32Array = 0.5 * (
             vertices.min(axis=0) + vertices.max(axis=0)
         )
         object_mesh = (
@@ -320,8 +325,8 @@ class Arrangement:
         self,
         surfaces: Sequence[texels.LitTexels],
         charts: prediction.Charts,
-        vertices: assets.Float32Array,
-        normals: assets.Float32Array,
+        vertices: Float32Array,
+        normals: Float32Array,
         met_cells: Ints,
     ) -> list[Tensor]:
         """Return for each side of the object a matrix from texels to the fine grid.
@@ -346,9 +351,7 @@ class Arrangement:
             for side in range(self.n_sides)
         ]
 
-    def _make_ground_texels(
-        self, object_center: assets.Float32Array
-    ) -> texels.LitTexels:
+    def _make_ground_texels(self, object_center: Float32Array) -> texels.LitTexels:
         """Return the texels of the ground, which goes on from below the object (3,)."""
         is_photographed = self._scene.description_and_filter[0].photograph is not None
         reach = self._compute_ground_reach(is_photographed)
@@ -367,7 +370,7 @@ class Arrangement:
             seed=seed,
         )
 
-    def _make_view_tracer(self, object_center: assets.Float32Array) -> ViewTracer:
+    def _make_view_tracer(self, object_center: Float32Array) -> ViewTracer:
         """Return the tracer of camera rays, with the lens that the inputs set.
 
         Args:
@@ -390,7 +393,7 @@ class Arrangement:
         """Return the texels of the ground; it follows the sides of the object."""
         return self.texels.select_grid(self.n_sides)
 
-    def _is_sky(self, cells: Ints) -> assets.BoolArray:
+    def _is_sky(self, cells: Ints) -> BoolArray:
         """Return which of the cells that rays met are the sky's.
 
         The cells of the sky are numbered after those of all surfaces.
@@ -410,7 +413,7 @@ class Arrangement:
         sees_sky = self._is_sky(met_cells[self._select_ground()]).any(axis=1)
         return texels.make_smoothing_matrix(ground, np.asarray(sees_sky))
 
-    def _get_object_buffer(self, buffer: str) -> assets.Float32Array:
+    def _get_object_buffer(self, buffer: str) -> Float32Array:
         """Return the object's "vertices" or "normals" (V, 3).
 
         They are those of the inputs, or else of the scene as it was loaded.
@@ -421,14 +424,14 @@ class Arrangement:
             if name in self.inputs
             else self._scene.get_base_value(name)
         )
-        rows: assets.Float32Array = values.reshape(-1, 3).numpy()
+        rows: Float32Array = values.reshape(-1, 3).numpy()
         return rows
 
     def _make_object_texels(
         self,
         charts: prediction.Charts,
-        vertices: assets.Float32Array,
-        normals: assets.Float32Array,
+        vertices: Float32Array,
+        normals: Float32Array,
     ) -> list[texels.LitTexels]:
         """Return the texels of the object, as one surface.
 
@@ -461,7 +464,7 @@ class Arrangement:
             return math.inf
         return self._scene.description_and_filter[0].get_number("ground.size") / 2.0
 
-    def _find_buried(self, met_cells: Ints, side: int) -> assets.BoolArray:
+    def _find_buried(self, met_cells: Ints, side: int) -> BoolArray:
         """Return which texels (n,) of one side of the object lie inside something.
 
         A ray inside of something meets the back of a face. A texel is buried if more
@@ -506,7 +509,7 @@ class Arrangement:
             self.texels.normals[texel],
         )
 
-    def _find_opaque_texels(self, front: slice) -> assets.IntArray:
+    def _find_opaque_texels(self, front: slice) -> IntArray:
         """Return the texels of the object's front with the largest opacity.
 
         Without an opacity map these are all. The front is the first grid, so that its
@@ -523,12 +526,10 @@ class Arrangement:
         opacity_row = row * opacity.shape[0] // n_rows
         opacity_column = column * opacity.shape[1] // n_columns
         texel_opacity = opacity[opacity_row, opacity_column]
-        opaque_texels: assets.IntArray = candidates[
-            texel_opacity >= texel_opacity.max()
-        ]
+        opaque_texels: IntArray = candidates[texel_opacity >= texel_opacity.max()]
         return opaque_texels
 
-    def _find_ground_below(self, center: assets.Float32Array) -> tuple[Tensor, Tensor]:
+    def _find_ground_below(self, center: Float32Array) -> tuple[Tensor, Tensor]:
         """Find where the blurred maps, seen from the object's center, show the ground.
 
         A photographed ground takes its color from the environment's map. The color of a
@@ -838,7 +839,7 @@ def _make_upsampling_matrix(
     return scipy.sparse.csr_matrix(entries, (n_fine, texture[0] * texture[1]))
 
 
-def _compute_cell_centers(shape: tuple[int, int]) -> assets.Float32Array:
+def _compute_cell_centers(shape: tuple[int, int]) -> Float32Array:
     """Return the centers (cells, 2) of a grid's cells, as columns and rows in [0, 1]."""
     n_rows, n_columns = shape
     y, x = np.meshgrid(

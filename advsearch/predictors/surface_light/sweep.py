@@ -50,16 +50,15 @@ def find_break_even(
     """
     height, width = renderer.formation.resolution
     preparation_samples = ARRANGEMENT_SAMPLES * arrangements + LIGHT_SAMPLES
-    fixed_spp = preparation_samples / (height * width) + prediction.count_check_samples(
-        spp
-    )
+    check_spp = prediction.count_check_samples(spp)
+    fixed_spp = preparation_samples / (height * width) + check_spp
     return math.ceil(prediction.MIN_SAVING_FACTOR * fixed_spp / (spp - PREDICTION_SPP))
 
 
 class LightOnSurfaces(prediction.SweepMethod):
     """Predicts images at one size of a scene by light that is stored on surfaces.
 
-    Images of a group differ only in the camera. prediction.Groups in which object and surroundings
+    Images of a group differ only in the camera. Groups in which object and surroundings
     do not move share an *arrangement*: what their surfaces see of each other. Its rays
     are the same for every group, so that it does not matter which group is first.
     """

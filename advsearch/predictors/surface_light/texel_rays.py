@@ -19,6 +19,9 @@ from torch import Tensor
 
 from advsearch.extend import assets, prediction
 
+Float32Array: TypeAlias = assets.Float32Array
+Float64Array: TypeAlias = assets.Float64Array
+
 dr = prediction.dr
 mi = prediction.mi
 
@@ -63,8 +66,8 @@ def trace_texel_rays(
     scene: prediction.MitsubaScene,
     grids: Grids,
     sky_shape: tuple[int, int],
-    positions: assets.Float32Array,
-    normals: assets.Float32Array,
+    positions: Float32Array,
+    normals: Float32Array,
     n_rays: int,
     seed: int,
 ) -> Ints:
@@ -110,9 +113,7 @@ def trace_texel_rays(
     return met_cells
 
 
-def _shift_points(
-    points: Any, ray_index: Any, shifts: assets.Float32Array, texel: Any
-) -> Any:
+def _shift_points(points: Any, ray_index: Any, shifts: Float32Array, texel: Any) -> Any:
     """Return the point of each ray, shifted by its texel's shift in the unit square.
 
     Args:
@@ -127,7 +128,7 @@ def _shift_points(
     return square
 
 
-def _spread_points(count: int) -> assets.Float64Array:
+def _spread_points(count: int) -> Float64Array:
     """Return points (count, 2) that fill the unit square evenly.
 
     They are the additive recurrence of the plastic number (Roberts 2018, The
@@ -231,10 +232,10 @@ def _put_texel_cells(
 
 def compute_visible_cosines(
     scene: prediction.MitsubaScene,
-    positions: assets.Float32Array,
-    normals: assets.Float32Array,
-    directions: assets.Float32Array,
-) -> assets.Float32Array:
+    positions: Float32Array,
+    normals: Float32Array,
+    directions: Float32Array,
+) -> Float32Array:
     """Return how much light from several directions arrives at texels.
 
     It is the cosine to the normal, times the fraction of light that passes cut-outs.
@@ -263,14 +264,12 @@ def compute_visible_cosines(
 
 
 def _rotate_to_world(
-    scene: prediction.MitsubaScene, directions: assets.Float32Array
-) -> assets.Float32Array:
+    scene: prediction.MitsubaScene, directions: Float32Array
+) -> Float32Array:
     """Return directions (k, 3) in the world, from the axes of the environment's map."""
     world_to_map = np.array(get_world_to_map(scene))
     # For rows v, `v @ world_to_map` is v turned from the map's axes to the world's.
-    world_directions: assets.Float32Array = (directions @ world_to_map).astype(
-        np.float32
-    )
+    world_directions: Float32Array = (directions @ world_to_map).astype(np.float32)
     return world_directions
 
 
@@ -297,7 +296,7 @@ def _trace_transmittance(scene: prediction.MitsubaScene, ray: Any, active: Any) 
 
 
 def is_visible_from_behind(
-    scene: prediction.MitsubaScene, name: str, positions: assets.Float32Array
+    scene: prediction.MitsubaScene, name: str, positions: Float32Array
 ) -> bool:
     """Return whether backs of a shape's faces are visible from outside.
 
@@ -324,7 +323,7 @@ def is_visible_from_behind(
     return bool(n_back_hits > MIN_BACK_FRACTION * n_hits)
 
 
-def _sample_outside_rays(positions: assets.Float32Array) -> Any:
+def _sample_outside_rays(positions: Float32Array) -> Any:
     """Return `N_OUTSIDE_RAYS` random rays from above onto positions (n, 3)."""
     generator = np.random.default_rng(0)
     to_origin = generator.standard_normal((N_OUTSIDE_RAYS, 3))
@@ -473,7 +472,7 @@ def _compute_cell_index(fraction: Any, count: int) -> Any:
 
 
 def _to_drjit_points(
-    kind: Any, rows: assets.Float32Array | assets.Float64Array, index: Any = None
+    kind: Any, rows: Float32Array | Float64Array, index: Any = None
 ) -> Any:
     """Convert rows of numbers to Dr.Jit's points, vectors or normals.
 
@@ -503,22 +502,12 @@ class Lobes:
     """
 
     # (k,) fraction of even light that is reflected diffusely for a base color of 1
-    diffuse: assets.Float32Array
-    gloss: (
-        assets.Float32Array
-    )  # (k,) fraction of even light reflected for any base color
-    up: (
-        assets.Float32Array
-    )  # (k,) component of the gloss's mean direction along the normal
-    along: (
-        assets.Float32Array
-    )  # (k,) its component along the surface, away from the viewer
-    core: (
-        assets.Float32Array
-    )  # (k,) root mean square angle about it in the core, radians
-    tail: (
-        assets.Float32Array
-    )  # (k,) root mean square angle about it in the tail, radians
+    diffuse: Float32Array
+    gloss: Float32Array  # (k,) fraction of even light reflected for any base color
+    up: Float32Array  # (k,) component of the gloss's mean direction along the normal
+    along: Float32Array  # (k,) its component along the surface, away from the viewer
+    core: Float32Array  # (k,) root mean square angle about it in the core, radians
+    tail: Float32Array  # (k,) root mean square angle about it in the tail, radians
 
     @classmethod
     def make_diffuse(cls) -> Lobes:
@@ -548,23 +537,19 @@ class _BsdfSamples(NamedTuple):
     surface, which only has gloss.
     """
 
-    grey: assets.Float64Array  # for a base color of 0.5
-    black: assets.Float64Array  # for a base color of 0
-    weight: (
-        assets.Float64Array
-    )  # value over density of the direction; its mean is the gloss
-    x: (
-        assets.Float64Array
-    )  # component of the direction along the surface, towards the viewer
-    z: assets.Float64Array  # component of the direction along the normal
+    grey: Float64Array  # for a base color of 0.5
+    black: Float64Array  # for a base color of 0
+    weight: Float64Array  # value over density of the direction; its mean is the gloss
+    x: Float64Array  # component of the direction along the surface, towards the viewer
+    z: Float64Array  # component of the direction along the normal
 
 
 def measure_lobes(
     scene: prediction.MitsubaScene,
     inputs: Mapping[str, Tensor],
     grid: TexelGrid,
-    position: assets.Float32Array,
-    normal: assets.Float32Array,
+    position: Float32Array,
+    normal: Float32Array,
 ) -> Lobes:
     """Measure how a shape reflects at one of its texels, by sampling its BSDF.
 
@@ -595,8 +580,8 @@ def measure_lobes(
 
 
 def _measure_squared_angles(
-    samples: _BsdfSamples, towards_viewer: assets.Float64Array, up: assets.Float64Array
-) -> assets.Float64Array:
+    samples: _BsdfSamples, towards_viewer: Float64Array, up: Float64Array
+) -> Float64Array:
     """Return the squared angle from each sample of the gloss to its mean direction.
 
     It is approximated by the squared distance of unit vectors, 2 - 2 cos(angle).
@@ -609,7 +594,7 @@ def _measure_squared_angles(
     return np.asarray(2.0 * np.maximum(0.0, half_square))
 
 
-def _measure_diffuse_fraction(samples: _BsdfSamples) -> assets.Float64Array:
+def _measure_diffuse_fraction(samples: _BsdfSamples) -> Float64Array:
     """Return the fraction (N_ANGLES,) of even light reflected diffusely, for a base color of 1.
 
     The base color of `grey` is 0.5 and that of `black` is 0. Their difference is the
@@ -620,8 +605,8 @@ def _measure_diffuse_fraction(samples: _BsdfSamples) -> assets.Float64Array:
 
 
 def _measure_mean_direction(
-    samples: _BsdfSamples, gloss: assets.Float64Array, cosine: assets.Float64Array
-) -> tuple[assets.Float64Array, assets.Float64Array]:
+    samples: _BsdfSamples, gloss: Float64Array, cosine: Float64Array
+) -> tuple[Float64Array, Float64Array]:
     """Return both components (N_ANGLES,) of the mean direction of gloss.
 
     They are along the surface towards the viewer, and along the normal. Without gloss
@@ -647,9 +632,9 @@ def _sample_bsdf(
     scene: prediction.MitsubaScene,
     inputs: Mapping[str, Tensor],
     grid: TexelGrid,
-    position: assets.Float32Array,
-    normal: assets.Float32Array,
-    cosines: assets.Float64Array,
+    position: Float32Array,
+    normal: Float32Array,
+    cosines: Float64Array,
 ) -> _BsdfSamples:
     """Sample the BSDF at a point for each cosine (N_ANGLES,) of the angle of view.
 
@@ -692,7 +677,7 @@ def _sample_bsdf(
     )
 
 
-def _make_viewer_directions(cosines: assets.Float64Array) -> Any:
+def _make_viewer_directions(cosines: Float64Array) -> Any:
     """Return directions to viewers, one lane for each sample, angle by angle.
 
     They are in the frame of the surface, whose z is the normal. `cosines` (N_ANGLES,)
@@ -752,8 +737,8 @@ def _set_base_color(
 
 def _hit_point(
     mitsuba_scene: Any,
-    position: assets.Float32Array,
-    normal: assets.Float32Array,
+    position: Float32Array,
+    normal: Float32Array,
     to_viewer: Any,
 ) -> Any:
     """Return the surface interaction at a point (3,), as seen by viewers.
@@ -782,8 +767,8 @@ def _eval_opacity(si: Any) -> Any:
 
 
 def _measure_spreads(
-    weight: assets.Float64Array, squared_angle: assets.Float64Array
-) -> tuple[assets.Float64Array, assets.Float64Array]:
+    weight: Float64Array, squared_angle: Float64Array
+) -> tuple[Float64Array, Float64Array]:
     """Return root mean square angles (k,) of both halves of weighted samples (k, n).
 
     The halves have equal weight. The first half has the samples with smaller angles,
@@ -806,6 +791,6 @@ def _measure_spreads(
     return core, tail
 
 
-def _to_table(values: npt.NDArray[Any]) -> assets.Float64Array:
+def _to_table(values: npt.NDArray[Any]) -> Float64Array:
     """Convert numbers of all lanes to a table (N_ANGLES, N_LOBE_SAMPLES)."""
     return np.asarray(values, dtype=np.float64).reshape(N_ANGLES, N_LOBE_SAMPLES)

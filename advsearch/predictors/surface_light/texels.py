@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +28,11 @@ from torch.nn import functional
 
 from advsearch.extend import assets, prediction
 from advsearch.predictors.surface_light.texel_rays import TexelGrid
+
+BoolArray: TypeAlias = assets.BoolArray
+Float32Array: TypeAlias = assets.Float32Array
+Float64Array: TypeAlias = assets.Float64Array
+IntArray: TypeAlias = assets.IntArray
 
 GROUND_TEXELS = 112  # texels along each side of the ground
 # Half the width of the ground that has texels, in object sizes. The ground beyond has
@@ -55,14 +60,12 @@ class LitTexels:
     """
 
     grids: tuple[TexelGrid, ...]  # grid of each surface, the searched one first
-    positions: assets.Float32Array  # (n, 3) positions in world space
-    normals: assets.Float32Array  # (n, 3)
+    positions: Float32Array  # (n, 3) positions in world space
+    normals: Float32Array  # (n, 3)
     cell_of_texel: (
-        assets.IntArray  # (n,) index of each texel's cell, among the cells of all grids
+        IntArray  # (n,) index of each texel's cell, among the cells of all grids
     )
-    texel_of_cell: (
-        assets.IntArray
-    )  # (cells of all grids,) index of each cell's nearest texel
+    texel_of_cell: IntArray  # (cells of all grids,) index of each cell's nearest texel
     # index of the first texel of each grid, followed by the number of all texels
     first_texels: tuple[int, ...]
 
@@ -104,8 +107,8 @@ def join_texels(surfaces: Sequence[LitTexels]) -> LitTexels:
 def make_mesh_texels(
     name: str,
     charts: prediction.Charts,
-    vertices: assets.Float32Array,
-    normals: assets.Float32Array,
+    vertices: Float32Array,
+    normals: Float32Array,
     side: int = 0,
 ) -> LitTexels:
     """Return the texels over a mesh.
@@ -194,7 +197,7 @@ def _find_ground_rate(half_width: float) -> float:
 
 def _compute_ground_positions(
     rate: float, scale: float, height: float, center: tuple[float, float]
-) -> assets.Float32Array:
+) -> Float32Array:
     """Return the positions (n, 3) of the ground's texels; see `make_ground_texels`."""
     axis_position = (np.arange(GROUND_TEXELS) + 0.5) * 2.0 / GROUND_TEXELS - 1.0
     axis_offset = scale * np.sinh(rate * axis_position)
@@ -231,10 +234,10 @@ class _SurfacePoints(NamedTuple):
         normal: (N, 3) at the points.
     """
 
-    row: assets.Float64Array
-    column: assets.Float64Array
-    position: assets.Float32Array
-    normal: assets.Float32Array
+    row: Float64Array
+    column: Float64Array
+    position: Float32Array
+    normal: Float32Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,11 +257,9 @@ class _BilateralFilter:
     texels: LitTexels
     charts: prediction.Charts
     texel_width: float
-    buried: assets.BoolArray
+    buried: BoolArray
 
-    def weigh_texels(
-        self, points: _SurfacePoints
-    ) -> tuple[assets.IntArray, assets.Float64Array]:
+    def weigh_texels(self, points: _SurfacePoints) -> tuple[IntArray, Float64Array]:
         """Return the texels whose light counts at points, and their weights.
 
         Returns:
@@ -271,9 +272,7 @@ class _BilateralFilter:
         weights /= weights.sum(axis=1, keepdims=True)
         return texel_index, weights
 
-    def weigh_neighbors(
-        self, points: _SurfacePoints
-    ) -> tuple[assets.IntArray, assets.Float64Array]:
+    def weigh_neighbors(self, points: _SurfacePoints) -> tuple[IntArray, Float64Array]:
         """Return the texels around points, and their weights.
 
         Returns:
@@ -295,7 +294,7 @@ class _BilateralFilter:
             weights.append(self._weigh(points, row, column, texel))
         return np.stack(neighbors, axis=1), np.stack(weights, axis=1)
 
-    def _number_texels(self) -> assets.IntArray:
+    def _number_texels(self) -> IntArray:
         """Return the index of the texel in each cell of the grid; -1 outside of charts.
 
         Texels are the covered cells, numbered row by row.
@@ -307,10 +306,10 @@ class _BilateralFilter:
     def _weigh(
         self,
         points: _SurfacePoints,
-        row: assets.IntArray,
-        column: assets.IntArray,
-        texel: assets.IntArray,
-    ) -> assets.Float64Array:
+        row: IntArray,
+        column: IntArray,
+        texel: IntArray,
+    ) -> Float64Array:
         """Return the weights (N,) of the neighbors of points at rows and columns.
 
         A neighbor outside of the charts has the index -1, and gets the weight 0.
@@ -332,8 +331,8 @@ class _BilateralFilter:
     def use_nearest_texel(
         self,
         points: _SurfacePoints,
-        texel_index: assets.IntArray,
-        weights: assets.Float64Array,
+        texel_index: IntArray,
+        weights: Float64Array,
     ) -> None:
         """Give all the weight to the nearest texel if no neighbor of a point has any.
 
@@ -358,9 +357,9 @@ def make_lookup_matrix(
     texels: LitTexels,
     charts: prediction.Charts,
     shape: tuple[int, int],
-    vertices: assets.Float32Array,
-    normals: assets.Float32Array,
-    buried: assets.BoolArray,
+    vertices: Float32Array,
+    normals: Float32Array,
+    buried: BoolArray,
 ) -> Tensor:
     """Return the matrix that smooths light and looks it up in a finer grid.
 
@@ -396,9 +395,9 @@ def make_lookup_matrix(
 
 def _find_cell_points(
     fine_charts: prediction.Charts,
-    is_selected: assets.BoolArray,
-    vertices: assets.Float32Array,
-    normals: assets.Float32Array,
+    is_selected: BoolArray,
+    vertices: Float32Array,
+    normals: Float32Array,
     charts: prediction.Charts,
 ) -> _SurfacePoints:
     """Return the surface points of cells of a finer grid.
@@ -422,9 +421,9 @@ def _find_cell_points(
 
 
 def _make_sparse(
-    fine_cell: assets.IntArray,
-    texel_index: assets.IntArray,
-    weights: assets.Float64Array,
+    fine_cell: IntArray,
+    texel_index: IntArray,
+    weights: Float64Array,
     size: tuple[int, int],
 ) -> Tensor:
     """Return a sparse matrix of weights, without those of 0.001 and less.
@@ -443,9 +442,7 @@ def _make_sparse(
     return prediction.to_torch_csr(scipy.sparse.coo_matrix(entries, size).tocsr())
 
 
-def _compute_texel_width(
-    charts: prediction.Charts, vertices: assets.Float32Array
-) -> float:
+def _compute_texel_width(charts: prediction.Charts, vertices: Float32Array) -> float:
     """Return the mean width of a texel in world space.
 
     `vertices` are (V, 3) in world space, while the charts' areas are in the mesh's own
@@ -458,8 +455,8 @@ def _compute_texel_width(
 
 
 def _iter_neighbourhood(
-    y: assets.Float64Array, x: assets.Float64Array
-) -> Iterator[tuple[assets.IntArray, assets.IntArray]]:
+    y: Float64Array, x: Float64Array
+) -> Iterator[tuple[IntArray, IntArray]]:
     """Yield rows and columns (N,) of the neighbours of positions in a grid.
 
     A position's neighbours are the texels up to `FILTER_REACH` from the texel nearest
@@ -476,7 +473,7 @@ def _iter_neighbourhood(
             yield nearest_row + row_offset, nearest_column + column_offset
 
 
-def make_smoothing_matrix(ground: LitTexels, sees_sky: assets.BoolArray) -> Tensor:
+def make_smoothing_matrix(ground: LitTexels, sees_sky: BoolArray) -> Tensor:
     """Return the matrix that smooths the light of a ground, by 5 x 5 binomial weights.
 
     A texel that sees nothing of the sky lies under something, and is dark. It does not
@@ -501,7 +498,7 @@ def make_smoothing_matrix(ground: LitTexels, sees_sky: assets.BoolArray) -> Tens
     return prediction.to_torch_csr(rows)
 
 
-def _make_binomial_weights(is_used: assets.BoolArray) -> scipy.sparse.csr_array:
+def _make_binomial_weights(is_used: BoolArray) -> scipy.sparse.csr_array:
     """Return the weights (n, n) of used texels (w, w) for each texel.
 
     Rows sum to 1, or to 0 if no texel nearby is used.
@@ -525,9 +522,9 @@ def _make_binomial_weights(is_used: assets.BoolArray) -> scipy.sparse.csr_array:
 
 def _interpolate(
     charts: prediction.Charts,
-    vertices: assets.Float32Array,
-    normals: assets.Float32Array,
-) -> tuple[assets.Float32Array, assets.Float32Array]:
+    vertices: Float32Array,
+    normals: Float32Array,
+) -> tuple[Float32Array, Float32Array]:
     """Return the position and the unit normal (h, w, 3) of the surface in each cell.
 
     Args:
@@ -543,7 +540,7 @@ def _interpolate(
     return position.astype(np.float32), unit_normal.astype(np.float32)
 
 
-def _find_nearest(covered: assets.BoolArray) -> assets.IntArray:
+def _find_nearest(covered: BoolArray) -> IntArray:
     """Return for each cell (h * w,) the flat index of the nearest covered cell.
 
     A covered cell is its own nearest.
@@ -554,7 +551,7 @@ def _find_nearest(covered: assets.BoolArray) -> assets.IntArray:
     rows, columns = ndimage.distance_transform_edt(
         ~covered, return_distances=False, return_indices=True
     )
-    nearest: assets.IntArray = (rows * covered.shape[1] + columns).ravel()
+    nearest: IntArray = (rows * covered.shape[1] + columns).ravel()
     return nearest
 
 
@@ -836,7 +833,7 @@ def compute_irradiance(
 
 
 def make_view_matrices(
-    met_cells: npt.NDArray[np.int32], texel_of_cell: assets.IntArray, n_texels: int
+    met_cells: npt.NDArray[np.int32], texel_of_cell: IntArray, n_texels: int
 ) -> tuple[Tensor, Tensor]:
     """Return the matrices from radiance to irradiance, by what the rays of texels met.
 
@@ -862,7 +859,7 @@ def make_view_matrices(
 
 
 def _make_ray_matrix(
-    is_entry: assets.BoolArray, column: npt.NDArray[np.integer[Any]], n_columns: int
+    is_entry: BoolArray, column: npt.NDArray[np.integer[Any]], n_columns: int
 ) -> Tensor:
     """Return a sparse matrix (n, columns) in which selected rays count pi / n_rays.
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -19,6 +19,8 @@ from torch.nn import functional
 
 from advsearch.extend import assets, prediction
 from advsearch.predictors.surface_light import texel_rays
+
+Float32Array: TypeAlias = assets.Float32Array
 
 dr = prediction.dr
 mi = prediction.mi
@@ -141,7 +143,7 @@ class ViewTracer:
         widths: Sequence[float],
         photograph_height: float | None,
         model: prediction.CameraModel | None,
-        center: assets.Float32Array,
+        center: Float32Array,
     ) -> None:
         """Prepare the tables of all surfaces and of the lens for the kernel.
 
@@ -163,7 +165,7 @@ class ViewTracer:
         self._lens = None if model is None else self._make_lens_table(model)
         self._recordings = prediction.Recordings()
 
-    def _make_lens_table(self, model: prediction.CameraModel) -> assets.Float32Array:
+    def _make_lens_table(self, model: prediction.CameraModel) -> Float32Array:
         """Return the lens's rays through each pixel, flat, four numbers each.
 
         The first three are the direction in the camera's axes; the fourth is above 0
@@ -181,7 +183,7 @@ class ViewTracer:
         x = (column.ravel() + x_offset) / width
         y = (row.ravel() + y_offset) / height
         positions = torch.from_numpy(np.stack([x, y], axis=1))
-        table: assets.Float32Array = model.make_ray_table(positions).numpy().ravel()
+        table: Float32Array = model.make_ray_table(positions).numpy().ravel()
         return table
 
     def __call__(
@@ -675,7 +677,7 @@ class ViewTracer:
         return _GridPosition(first_cell, n_rows, n_columns, y, x, on_any_grid)
 
 
-def _join_lobe_tables(lobes: Sequence[texel_rays.Lobes]) -> assets.Float32Array:
+def _join_lobe_tables(lobes: Sequence[texel_rays.Lobes]) -> Float32Array:
     """Return the tables of all surfaces, flat: the six of the first, then the next.
 
     The tables of a surface are in the order of `LOBE_TABLES`.
@@ -811,7 +813,7 @@ def _turn_to_viewer(normal: Any, direction: Any) -> Any:
 
 def _join_camera_numbers(
     cameras: Sequence[Mapping[str, Tensor]], height: int, width: int
-) -> assets.Float32Array:
+) -> Float32Array:
     """Return the `CAMERA_SIZE` numbers of all cameras, one after the other, flat.
 
     Args:
@@ -824,7 +826,7 @@ def _join_camera_numbers(
 
 def _make_camera_numbers(
     inputs: Mapping[str, Tensor], height: int, width: int
-) -> assets.Float32Array:
+) -> Float32Array:
     """Return the `CAMERA_SIZE` numbers of a camera as the kernel takes them.
 
     They are its axes to the left, up and forward (9 numbers), its position (3), half
@@ -885,7 +887,7 @@ def _fetch(channels: Sequence[Any], size: tuple[int, int, int]) -> ViewSamples:
         )
 
 
-def _stack_layers(channels: Sequence[Any]) -> list[assets.Float32Array]:
+def _stack_layers(channels: Sequence[Any]) -> list[Float32Array]:
     """Return u, v and weight of all rays and layers, each (rays x layers,).
 
     The channels are u, v and weight of the first layer, then those of the next one. In

@@ -161,25 +161,28 @@ def _pays_to_measure_bounces(
         return False
     if problem.renderer.composition_reason:  # then nothing predicts the images
         return True
-    # methods whose images have all bounces, so that leaving some out changes nothing
-    methods = [method for method in make_methods() if not method.follows_bounces]
-    return not _select_usable(methods, problem, policy)
+    # If a method that always has all bounces may predict the images, then none are left
+    # out.
+    refusals = _find_refusals(problem, policy)
+    return all(
+        method.follows_bounces or refusal is not None for method, refusal in refusals
+    )
 
 
-def _select_usable(
-    methods: Sequence[PredictionMethod], problem: Problem, policy: Policy[Any]
-) -> list[PredictionMethod]:
-    """Return those of some methods that may predict the images of a search.
+def _find_refusals(
+    problem: Problem, policy: Policy[Any]
+) -> list[tuple[PredictionMethod, Refusal | None]]:
+    """Return every method, and why it does not predict the images of a search.
+
+    The refusal is None if it may predict them.
 
     Args:
-        methods: the methods.
         problem: problem of the search, whose images are not composed of several.
         policy: policy of the search.
     """
     return [
-        method
-        for method in methods
-        if method.find_search_refusal(problem, problem.steps, policy) is None
+        (method, method.find_search_refusal(problem, problem.steps, policy))
+        for method in make_methods()
     ]
 
 
@@ -404,8 +407,8 @@ def choose_predictor(
     refusal = find_general_refusal(problem, specialise)
     if refusal is not None:
         return _render_search(problem, refusal, stages, findings, specialise=specialise)
-    methods = make_methods()
-    candidates = _select_usable(methods, problem, policy)
+    refusals = _find_refusals(problem, policy)
+    candidates = [method for method, refusal in refusals if refusal is None]
     for index, method in enumerate(candidates):
         predictor = method.make_search(
             problem,
@@ -421,7 +424,9 @@ def choose_predictor(
         findings.inaccuracy_refusal = refusal
         _report_inaccuracy(refusal, stages, candidates[index + 1 :])
 
-    refusal = _choose_refusal(methods, problem, policy, findings)
+    refusal = findings.inaccuracy_refusal
+    if refusal is None:
+        refusal = _choose_refusal(problem, refusals)
     return _crop_search(problem, refusal, stages, findings)
 
 
@@ -450,41 +455,34 @@ def _report_inaccuracy(
     refusal: Refusal, stages: Stages, next_methods: Sequence[PredictionMethod]
 ) -> None:
     """Report that a predictor is too inaccurate, and what replaces it."""
-    instead = next_methods[0].what_it_does if next_methods else "rendered"
+    instead = next_methods[0].pictures_are if next_methods else "rendered"
     stages.progress.message(f"Pictures are {instead}: {refusal}.")
 
 
 def _choose_refusal(
-    methods: Sequence[PredictionMethod],
-    problem: Problem,
-    policy: Policy[Any],
-    findings: RunState,
+    problem: Problem, refusals: Sequence[tuple[PredictionMethod, Refusal | None]]
 ) -> Refusal:
-    """Return the refusal to report if no method predicts the images of a search.
+    """Return the refusal to report if no method could be tried.
 
     Only one reason is reported: that of matrices, or that of another method. The user
     can act on the refusal of matrices if they need only more steps. If no camera moves,
     light on surfaces would not help anyway.
 
     Args:
-        methods: all methods.
         problem: problem of the attack.
-        policy: policy of the search.
-        findings: findings of the attack, with a method that was tried and inaccurate.
+        refusals: every method, and why it does not predict the images.
     """
     matrix_refusal = find_matrix_refusal(problem, problem.steps, specialise=True)
     if matrix_refusal is None:
-        # A matrix could predict each condition, but the predictor that does is missing.
+        # A matrix could predict each condition; the predictor that does is missing.
         matrix_refusal = Refusal("conditions vary, and there is no predictor `bank`")
-    if findings.inaccuracy_refusal is not None:
-        return findings.inaccuracy_refusal
     if find_matrix_refusal(problem, steps=None, specialise=True) is None:
         return matrix_refusal
-    for method in methods:
-        refusal = method.find_search_refusal(problem, problem.steps, policy)
-        if refusal is not None and refusal.cause not in UNHELPFUL_CAUSES:
-            if refusal != matrix_refusal:
-                return refusal
+    for _method, refusal in refusals:
+        is_helpful = refusal is not None and refusal.cause not in UNHELPFUL_CAUSES
+        # That of a bank of matrices is the one of matrices.
+        if refusal is not None and is_helpful and refusal != matrix_refusal:
+            return refusal
     return matrix_refusal
 
 

@@ -37,6 +37,7 @@ from advsearch.scene.predictor import (
     NOTHING_MOVES,
     Predictor,
     Refusal,
+    RefusalCause,
 )
 
 
@@ -115,7 +116,7 @@ class SweepPredictor:
                 return method, None
             refused.append((method, refusal))
         for method, refusal in refused:
-            could_predict_something = refusal is not NOTHING_MOVES
+            could_predict_something = refusal.cause is not RefusalCause.NOTHING_MOVES
             if could_predict_something:
                 return method, refusal
         return refused[-1]
@@ -334,9 +335,9 @@ class SweepPredictor:
         That is the worst deviation, the memory and the time, or why images are
         rendered. None if nothing varies that a method could predict.
         """
-        if self.refusal is NOTHING_MOVES:
-            return None
         if self.refusal is not None:
+            if self.refusal.cause is RefusalCause.NOTHING_MOVES:
+                return None
             return LinearTransport(used=False, reason=str(self.refusal))
         # `entries` and `renewed` are about the matrix of an attack. Sweeps have none.
         return LinearTransport(

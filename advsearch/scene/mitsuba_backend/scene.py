@@ -44,9 +44,9 @@ from advsearch.scene.mitsuba_backend.transport import (
     find_first_hits,
 )
 from advsearch.scene.mitsuba_backend.variant import (
-    add_without_copies,
     Plugin,
     Recordings,
+    add_without_copies,
     dr,
     mi,
     mitsuba_lock,

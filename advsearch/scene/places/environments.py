@@ -18,7 +18,7 @@ from advsearch.scene.library import (
     list_environments,
     load_environment,
 )
-from advsearch.scene.photographed_ground import compute_irradiance
+from advsearch.scene.photographed_ground import compute_open_sky_irradiance
 from advsearch.scene.places.place_file import (
     read_place,
     read_place_file,
@@ -124,4 +124,4 @@ def _compute_illuminance(environment: EnvironmentAsset) -> float:
     In the environment's own unit: its radiance has none.
     """
     radiance = torch.from_numpy(environment.radiance.copy())
-    return float(compute_irradiance(radiance) @ torch.tensor(LUMINANCE))
+    return float(compute_open_sky_irradiance(radiance) @ torch.tensor(LUMINANCE))
