@@ -26,6 +26,8 @@ from advsearch.tasks import make_task
 from advsearch.trust.code import restrict_allowed_code
 from advsearch.trust.network import KEY, check_address
 
+pytestmark = pytest.mark.island("advsearch.models.address")
+
 SECRET = "sk-very-secret"
 SMALL = ["--object", "mug", "--resolution", "24", "--spp", "2", "--verify-spp", "4", "--trials", "6", "--quiet"]
 

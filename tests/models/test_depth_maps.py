@@ -13,6 +13,8 @@ from advsearch import load_model
 from advsearch.tasks.depth import DISPARITY, METRIC, Depth, DepthTruth
 from small_models import assert_slope
 
+pytestmark = pytest.mark.island("advsearch.tasks.depth")
+
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 
 SIDE = 32

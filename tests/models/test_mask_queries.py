@@ -19,7 +19,7 @@ SIDE = 64
 NAMES = ("mug", "bowl", "vase")
 PICTURE = torch.rand((SIDE, SIDE, 3), generator=torch.Generator().manual_seed(0)).mul(255).round() / 255
 WARNED = pytest.mark.filterwarnings("ignore:.*margins are logarithms of a ratio of scores")
-pytestmark = WARNED
+pytestmark = [WARNED, pytest.mark.island("advsearch.tasks.segmentation")]
 ROUNDED = pytest.mark.filterwarnings("ignore:.*sees an image differently in a batch")
 """Of a grey picture group normalisation divides rounding by next to nothing, which random weights make much of."""
 SWIN = {"image_size": SIDE, "patch_size": 4, "embed_dim": 4, "depths": [1] * 4, "num_heads": [1] * 4, "window_size": 2}

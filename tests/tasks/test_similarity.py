@@ -20,6 +20,8 @@ from advsearch.tasks import Facts
 from advsearch.tasks.similarity import ITSELF, SOMETHING_ELSE, TEMPERATURE, Similarity
 from small_models import SIDE, save_exported
 
+pytestmark = pytest.mark.island("advsearch.tasks.similarity")
+
 COLOURS = {"blue": (0.2, 0.3, 0.9), "green": (0.2, 0.8, 0.3), "red": (0.9, 0.2, 0.2)}
 NAMES = tuple(COLOURS)
 

@@ -35,6 +35,8 @@ from advsearch.runs.store import Store
 from advsearch.runs.summary import read_result
 from advsearch.testing import assert_no_worse, assert_right
 
+pytestmark = pytest.mark.island("advsearch.questions.test")
+
 carry_out = get_experiment("test").run
 EASY, HARD = "small_models:easy", "small_models:hard"
 SMALL: dict[str, Any] = {"resolution": 32, "denoise": "none"}
