@@ -84,6 +84,7 @@ def published(folder: Path, family: str) -> str:
     return f"hf:{folder}"
 
 
+@pytest.mark.island("advsearch.models.zoo")
 @pytest.mark.medium
 @ROUNDED
 @pytest.mark.parametrize("family", SIZES)
@@ -111,6 +112,7 @@ def test_pixels_have_the_librarys_scores(tmp_path: Path, family: str) -> None:
     assert ours.argmax(dim=0).equal(theirs.segmentation) and float(ours.std()) > 0.01
 
 
+@pytest.mark.island("advsearch.models.zoo")
 def test_the_gradient_agrees_with_differences(tmp_path: Path) -> None:
     """Along a direction, of MaskFormer: the attention of the others has thresholds."""
     model: Any = load_model(published(tmp_path, "MaskFormer"), task="segmentation")

@@ -114,6 +114,7 @@ OWN = {
 """How the library itself says what the features of a picture are."""
 
 
+@pytest.mark.island("advsearch.models.zoo")
 @pytest.mark.parametrize("architecture", OWN)
 def test_features_are_those_of_the_librarys_own_pipeline(architecture: str, tmp_path: Path) -> None:
     spec = published(tmp_path / "net", architecture)
