@@ -88,7 +88,7 @@ def list_marks(tree: ast.AST) -> Iterator[str]:
     """Yield the modules that markers `island` name in a file of tests, or in a part of one."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "island":
-            yield from (argument.value for argument in node.args if isinstance(argument, ast.Constant))
+            yield from (str(argument.value) for argument in node.args if isinstance(argument, ast.Constant))
 
 
 def list_marks_of_file(tree: ast.Module) -> set[str]:
