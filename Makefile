@@ -19,7 +19,7 @@ SOURCES := advsearch scenes tests benchmarks docs tools
 export TORCH_INDEX
 
 .DEFAULT_GOAL := help
-.PHONY: help setup attack test test-all test-slow test-zoo fuzz check lint format typecheck docs bench study reference wheel check-wheel check-channels docs-versions clean
+.PHONY: help setup attack test test-core test-all test-slow test-zoo fuzz check lint format typecheck docs bench study reference wheel check-wheel check-channels docs-versions clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -35,6 +35,10 @@ attack: $(STAMP) ## search the worst texture for a mug; more flags through ARGS=
 
 test: $(STAMP) ## run the quick tests and the smallest whole commands, in four minutes; ARGS="-k name" picks some
 	@$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow and not docs and not medium" $(ARGS)
+
+test-core: $(STAMP) ## run the quick tests while all islands are hidden, or those of WITHOUT="control", or one: WITHOUT=advsearch.questions.harden
+	@$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow and not docs and not medium" \
+	  --without-islands "$(or $(WITHOUT),all)" $(ARGS)
 
 test-all: $(STAMP) ## run all tests but the slow ones
 	@bash tools/browser.sh

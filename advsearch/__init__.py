@@ -15,7 +15,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from advsearch.catalog import list_built_ins
+from advsearch.catalog import is_module_installed, list_built_ins
 from advsearch.registry import EXPERIMENTS, get_experiment
 from advsearch.version import __version__ as __version__
 
@@ -70,10 +70,16 @@ _HOMES = {
     "load_run": "advsearch.api.render",
     "load_scene": "advsearch.engine.loading",
     "measured_palette": "advsearch.api.chart",
-    "photo_agreement": "advsearch.questions.photographs.carry_out",
 }
 """The module of each public name. Every experiment is public, too."""
-_MODULES = ("controls", "losses", "maite", "testing")  # public modules
+_MODULES = ["controls", "losses", "maite"]  # public modules
+
+# These belong to islands, and are left out if their files are missing.
+if is_module_installed("advsearch.questions.photographs"):
+    _HOMES["photo_agreement"] = "advsearch.questions.photographs.carry_out"
+if is_module_installed("advsearch.testing"):
+    _MODULES.append("testing")
+
 __all__ = sorted({*_HOMES, *_MODULES, *list_built_ins("experiment")})
 
 

@@ -8,9 +8,11 @@ work on the machine changes little, and lists the tests whose marker is wrong.
 
 from __future__ import annotations
 
+import ast
 import gc
 import os
 import resource
+import sys
 import zlib
 from collections import defaultdict
 from collections.abc import Generator, Iterator
@@ -20,6 +22,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from PIL import Image
+
+import hidden_islands
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
@@ -152,6 +156,7 @@ class CpuTimes:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--without-islands", help="modules or kinds of islands that are hidden; all of them by `all`")
     parser.addoption("--measure", action="store_true", help="count CPU seconds, and list tests whose marker is wrong")
     parser.addoption("--one-in", type=int, default=1, help="of the slow tests run one in so many, others every day")
     parser.addoption("--day", type=date.fromisoformat, default=date.today(), help="which day's; as 2030-12-31")
@@ -160,6 +165,48 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("--measure"):
         config.pluginmanager.register(CpuTimes())
+    if config.getoption("--without-islands"):
+        config.pluginmanager.register(WithoutIslands(config.getoption("--without-islands")))
+
+
+class NotImported(pytest.Module):
+    """A file of tests that is left out as a whole."""
+
+    def collect(self) -> list[pytest.Item | pytest.Collector]:
+        return []
+
+
+class WithoutIslands:
+    """Hides islands before the package is imported, and leaves out the tests that need them."""
+
+    def __init__(self, asked: str) -> None:
+        from test_islands import ELSEWHERE, island_of_module
+
+        try:
+            self.islands = hidden_islands.choose_islands(asked, island_of_module())
+        except ValueError as error:
+            raise pytest.UsageError(f"--without-islands: {error}") from None
+        assert "advsearch" not in sys.modules  # it would have seen the islands already
+        self.needs = {"all", *self.islands}
+        modules = [*self.islands, *(name for name, island in ELSEWHERE.items() if island in self.islands)]
+        hidden_islands.hide(modules)
+        hidden_islands.hide_from_children(modules)
+
+    def pytest_pycollect_makemodule(self, module_path: Path, parent: pytest.Collector) -> pytest.Module | None:
+        """Do not import a file that needs a hidden island."""
+        tree = ast.parse(module_path.read_text("utf-8"))
+        if hidden_islands.list_marks_of_file(tree) & self.needs:
+            return NotImported.from_parent(parent, path=module_path)
+        return None
+
+    def pytest_collection_modifyitems(self, config: pytest.Config, items: list[pytest.Item]) -> None:
+        """Leave out the other tests that need one."""
+        needing = [one for one in items if any(self.needs.intersection(m.args) for m in one.iter_markers("island"))]
+        config.hook.pytest_deselected(items=needing)
+        items[:] = [one for one in items if one not in needing]
+
+    def pytest_report_header(self) -> str:
+        return f"{len(self.islands)} islands are hidden"
 
 
 def of_the_day(name: str, day: int, parts: int) -> bool:

@@ -1,10 +1,13 @@
 """Whole results that tests change in one place: what a command could have answered, made without doing any work."""
 
+from __future__ import annotations
+
+import csv
 import json
 import tempfile
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import OpenEXR
@@ -12,12 +15,14 @@ import OpenEXR
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult, load_attack_summary
-from advsearch.questions.region.result import RegionResult
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.runs.summary import write_configuration
 from advsearch.viewer.pages import write_page
+
+if TYPE_CHECKING:
+    from advsearch.questions.region.result import RegionResult
 
 PHOTOGRAPHS = Path(__file__).resolve().parent.parent / "scenes" / "photographs"
 """Two objects in twelve photographs of 128 x 96 pixels."""
@@ -199,6 +204,8 @@ def matrix(**changes: Any) -> MatrixResult:
 
 def region(**changes: Any) -> RegionResult:
     """Return a region's result with other fields."""
+    from advsearch.questions.region.result import RegionResult
+
     return RegionResult.from_values({**REGION, **changes})
 
 
@@ -262,21 +269,18 @@ def write_photograph_folder(folder: Path, name: str = "obj_000002", **entries: A
         name: of the object.
         **entries: further ones of the camera files.
     """
-    from advsearch.questions.twins.listing import read_photographs
-
     folder.mkdir()
-    for item in read_photographs(PHOTOGRAPHS / "photographs.csv").objects:
-        if item.object == name:
-            photograph = folder / item.photograph.name
-            photograph.write_bytes(item.photograph.read_bytes())
-            camera = item.camera
-            matrix = [[camera.fx, 0.0, camera.cx - 0.5], [0.0, camera.fy, camera.cy - 0.5], [0.0, 0.0, 1.0]]
+    for row in csv.DictReader((PHOTOGRAPHS / "photographs.csv").read_text("utf-8").splitlines()):
+        if Path(row["object"]).stem == name:
+            photograph = folder / Path(row["photograph"]).name
+            photograph.write_bytes((PHOTOGRAPHS / row["photograph"]).read_bytes())
+            camera, pose = (np.array(row[key].split(), dtype=float) for key in ("K", "pose"))
             stated = {
                 "image_width": 128,
                 "image_height": 96,
-                "camera_matrix": matrix,
+                "camera_matrix": camera.reshape(3, 3).tolist(),
                 "part": [16, 0, 96, 96],
-                "object_to_camera": item.pose.tolist(),
+                "object_to_camera": [*pose.reshape(3, 4).tolist(), [0.0, 0.0, 0.0, 1.0]],
                 **entries,
             }
             photograph.with_suffix(".json").write_text(json.dumps(stated), "utf-8")

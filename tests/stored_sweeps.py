@@ -12,7 +12,6 @@ import pandas as pd
 
 from advsearch.files import JsonValue
 from advsearch.options import Value
-from advsearch.questions.photographs.pages import PhotographPages
 from advsearch.questions.sweep.page import write_sweep_page
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.rules import make_table
@@ -94,7 +93,11 @@ def serving(
     *runs: Path, host: str = "127.0.0.1", https: bool = False, photographs: object | None = None
 ) -> Iterator[Dashboard]:
     """A server of these runs, for as long as the block."""
-    pages = None if photographs is None else PhotographPages(photographs)
+    pages = None
+    if photographs is not None:
+        from advsearch.questions.photographs.pages import PhotographPages
+
+        pages = PhotographPages(photographs)
     server = Dashboard(runs, host, 0, https=https, photographs=pages)
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
     thread.start()

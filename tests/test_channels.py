@@ -26,6 +26,7 @@ def test_values_reach_the_scripts_of_the_action_as_variables_alone() -> None:
     assert set(given) == set(ACTION["inputs"])
 
 
+@pytest.mark.island("advsearch.questions.test")
 @pytest.mark.parametrize(("pitch", "status"), [("0, 1", 0), ("80, 90", 1)])
 def test_the_step_of_the_action_that_tests(tmp_path: Path, pitch: str, status: int) -> None:
     (tmp_path / "suite.yaml").write_text(

@@ -48,6 +48,8 @@ from advsearch.scene.settings import resolve_settings
 from advsearch.settings import Config, parse_assignment, read_yaml
 from advsearch.tasks import make_task
 
+pytestmark = pytest.mark.island("all")
+
 every_page_with = {
     language: pytest.mark.parametrize("page", having, ids=[name_of(page) for page in having])
     for language in ("sh", "yaml", "python")

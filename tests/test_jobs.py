@@ -65,7 +65,15 @@ ATTACKS: dict[str, Sequence[str]] = {
 }
 
 
-@pytest.mark.parametrize("job", ATTACKS, ids=lambda job: job.replace(" ", "-"))
+NEEDED = {"patch over conditions": pytest.mark.island("advsearch.controls.patch")}
+"""What an attack needs beyond the core."""
+
+
+@pytest.mark.parametrize(
+    "job",
+    [pytest.param(job, marks=NEEDED.get(job, ())) for job in ATTACKS],
+    ids=lambda job: job.replace(" ", "-"),
+)
 def test_attack(job: str, tmp_path: Path) -> None:
     run_command("attack", "--object", "mug", *ATTACKS[job], *FEW, "--run", tmp_path / "run")
     assert load_summary(tmp_path / "run")
@@ -99,11 +107,13 @@ def test_export_rows(sweep_run: Path, tmp_path: Path) -> None:
     assert len((tmp_path / "rows.csv").read_text("utf-8").splitlines()) == 7
 
 
+@pytest.mark.island("advsearch.cli.exporters.scene")
 def test_export_mesh(attack_run: Path, tmp_path: Path) -> None:
     run_command("export", attack_run, "--format", "gltf", *CODE, "--out", tmp_path / "object.glb")
     assert (tmp_path / "object.glb").read_bytes()[:4] == b"glTF"
 
 
+@pytest.mark.island("advsearch.questions.replay")
 def test_replay(attack_run: Path, tmp_path: Path) -> None:
     run_command("replay", attack_run, "--ways", "samples,jpeg", "--trials", "6", *CODE, "--run", tmp_path / "replay")
 
@@ -122,11 +132,13 @@ def test_import(tmp_path: Path) -> None:
     run_command("import", tmp_path / "solid.obj")
 
 
+@pytest.mark.island("advsearch.questions.compare")
 def test_compare(tmp_path: Path) -> None:
     suite = ("--object", "mug", "--control", "pose", "--samples", "3", *SMALL)
     run_command("compare", "reference", "small_models:easy", *suite, "--run", tmp_path / "compare")
 
 
+@pytest.mark.island("advsearch.questions.test")
 def test_test(tmp_path: Path) -> None:
     claim = "{claim: right, at_least: 0.5, pictures: 100, settings: {controls: light}}"
     settings = "{object: mug, model: small_models:easy, resolution: 32}"
@@ -134,6 +146,7 @@ def test_test(tmp_path: Path) -> None:
     run_command("test", tmp_path / "claims.yaml", *CODE, "--run", tmp_path / "gate")
 
 
+@pytest.mark.island("advsearch.questions.check")
 def test_check(tmp_path: Path) -> None:
     run_command(
         "check",

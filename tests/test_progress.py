@@ -10,17 +10,15 @@ import torch
 
 from advsearch.attacks import Evaluation, Query, make_policy
 from advsearch.cli.flags import format_as_flags
+from advsearch.config import CONFIGS
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import RunState
 from advsearch.experiment import run_experiment as answered
 from advsearch.progress import Stages
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.precision.result import PrecisionConfig
-from advsearch.questions.region.result import RegionConfig
 from advsearch.questions.sweep.carry_out import sweep_from_config
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
-from advsearch.settings import Config
 from stand_ins import StandInProblem, attack_on, carry_out, configuration, rows
 
 JARGON = re.compile(r"set-up|rerank|adjoint|estimator|baseline|sample count|spp|bounces$|verification", re.IGNORECASE)
@@ -114,20 +112,28 @@ SMALL: dict[str, Any] = {**FEW, "spp": 1}
 
 @pytest.mark.medium
 @pytest.mark.parametrize(
-    "config",
+    ("command", "given"),
     [
-        AttackConfig(**SMALL, steps=3, trials=6, average=2, verify_spp=2),
-        SweepConfig(**SMALL, grid={"pose.yaw": "0,90"}, trials=6),
-        RegionConfig(**FEW, controls={"camera": {}}, vary="camera.azimuth", samples=8, verify_spp=1),
-        PrecisionConfig(
-            **SMALL, controls={"light": {}}, quantities="image", seconds=1, rounds=3, samplers="independent"
+        ("attack", {**SMALL, "steps": 3, "trials": 6, "average": 2, "verify_spp": 2}),
+        ("sweep", {**SMALL, "grid": {"pose.yaw": "0,90"}, "trials": 6}),
+        pytest.param(
+            "region",
+            {**FEW, "controls": {"camera": {}}, "vary": "camera.azimuth", "samples": 8, "verify_spp": 1},
+            marks=pytest.mark.island("advsearch.questions.region"),
+        ),
+        pytest.param(
+            "precision",
+            {
+                **SMALL, "controls": {"light": {}}, "quantities": "image", "seconds": 1, "rounds": 3,
+                "samplers": "independent",
+            },
+            marks=pytest.mark.island("advsearch.questions.precision"),
         ),
     ],
-    ids=lambda config: config.command,
-)
-def test_every_command_says_what_it_does_and_how_far_it_is(tmp_path: Path, config: Config) -> None:
+)  # fmt: skip
+def test_every_command_says_what_it_does_and_how_far_it_is(tmp_path: Path, command: str, given: dict[str, Any]) -> None:
     progress = Recorded()
-    answered(config.model_copy(update={"run": str(tmp_path / "run")}), progress=progress)
+    answered(CONFIGS[command](**given, run=str(tmp_path / "run")), progress=progress)
     progress.check()
     hints = [format_as_flags(one.hint) for one in progress.stages]
     assert any("--" in one for one in hints) and not any("`" in one for one in hints)

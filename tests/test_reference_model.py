@@ -11,6 +11,8 @@ from torch import Tensor
 from advsearch.models import reference
 from advsearch.questions.harden.networks import Augmentation
 
+pytestmark = pytest.mark.island("advsearch.questions.harden")
+
 
 def images(count: int = 2, height: int = 8, width: int = 8, seed: int = 0) -> Tensor:
     return torch.rand((count, height, width, 3), generator=torch.Generator().manual_seed(seed))

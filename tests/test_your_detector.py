@@ -10,6 +10,8 @@ from check_docs import DOCS, blocks
 from advsearch.cli.main import main
 from small_models import Finder, save_exported
 
+pytestmark = pytest.mark.island("all")
+
 PAGE = DOCS / "your-detector.md"
 NETWORK = "torchvision:ssdlite320_mobilenet_v3_large"
 SMALL = {

@@ -15,7 +15,6 @@ import advsearch
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.progress import NullProgress
 from advsearch.questions.attack.result import AttackResult
-from advsearch.questions.region.result import RegionResult
 from advsearch.questions.sweep.result import SweepResult
 
 SIDE = 16
@@ -71,8 +70,11 @@ def test_an_attack_comes_back_from_its_folder(attacked: AttackResult) -> None:
         loaded.render()
 
 
+@pytest.mark.island("advsearch.questions.region")
 @pytest.mark.medium
 def test_every_other_question_does_too(scene: advsearch.Scene, model: advsearch.Model, tmp_path: Path) -> None:
+    from advsearch.questions.region.result import RegionResult
+
     swept = advsearch.sweep(
         scene, model, {"pose.yaw": np.array([0.0, 90.0])}, run=tmp_path / "sweep", trials=0, **PICTURE
     )
@@ -107,6 +109,7 @@ def test_an_adversarial_scene_is_rendered_under_another_view(attacked: AttackRes
         other.render()
 
 
+@pytest.mark.island("advsearch.questions.replay")
 def test_a_result_is_replayed_with_the_network_of_the_session(attacked: AttackResult, tmp_path: Path) -> None:
     replayed = advsearch.replay(attacked, ways="curve", trials=6, run=tmp_path / "again", threads=1)
     assert replayed.model == "bright" and len(replayed.table) > 1

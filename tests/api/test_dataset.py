@@ -21,7 +21,7 @@ from samples import make_attacked
 from small_models import easy
 from stored_sweeps import rows_of
 
-pytestmark = pytest.mark.usefixtures("two_threads")
+pytestmark = [pytest.mark.usefixtures("two_threads"), pytest.mark.island("advsearch.cli.exporters.dataset")]
 
 EASY = "small_models:easy"
 

@@ -32,7 +32,6 @@ from advsearch.controls.ranges import Range, parse_spec
 from advsearch.files import JsonObject
 from advsearch.models import load_model
 from advsearch.models.model import Model, Preprocessing
-from advsearch.questions.stability.scenes import condition_number, estimate_hessian
 from advsearch.scene.color import linear_to_srgb, round_to_8_bit
 from advsearch.tasks import Classification, Judgement, Prediction
 
@@ -395,10 +394,13 @@ def valley(u: Tensor) -> Tensor:
     return -(100.0 * (y - x.square()).square() + (1.0 - x).square())
 
 
+@pytest.mark.island("advsearch.questions.stability")
 @pytest.mark.slow
 def test_policies_get_through_a_curved_valley() -> None:
     """PGD steps by signs in numbers that are blocks of their own, so it goes round the bend in small steps: it gets
     down into the valley, and no further than random search does in two dimensions."""
+    from advsearch.questions.stability.scenes import condition_number, estimate_hessian
+
     start = [0.2, 0.75]
     gaps = medians(valley, start, 400, lambda result: -result.best_objective)
     second = estimate_hessian(

@@ -39,8 +39,6 @@ from advsearch.attacks.verification import (
 )
 from advsearch.errors import InputError
 from advsearch.questions.attack.settings import MIN_TRIALS
-from advsearch.questions.region.boxes import GrownBox
-from advsearch.questions.region.result import MIN_SAMPLES
 from advsearch.seeds import derive_seed
 from advsearch.statistics.paired import paired_difference
 from advsearch.tasks import Judgement, Prediction
@@ -300,15 +298,22 @@ def test_conditions_under_which_the_clean_scene_is_seldom_right_leave_too_few_tr
     assert result.ending is Ending.NOT_VERIFIED
 
 
+@pytest.mark.island("advsearch.questions.region")
 def test_the_fewest_samples_of_a_region_follow_from_the_confidence_of_its_interval() -> None:
+    from advsearch.questions.region.boxes import GrownBox
+    from advsearch.questions.region.result import MIN_SAMPLES
+
     low, high = torch.zeros(1), torch.ones(1)
     for samples in (MIN_SAMPLES - 1, MIN_SAMPLES):
         region = GrownBox(low, low, high, samples, samples, samples)
         assert (region.interval[0] >= MIN_RATE) == (samples == MIN_SAMPLES)
 
 
+@pytest.mark.island("advsearch.questions.region")
 def test_the_interval_of_a_region_covers_although_it_is_sampled_until_nothing_differs() -> None:
     """Exactly, where a part of the box has another verdict wherever it is cut; without its correction it would not."""
+    from advsearch.questions.region.boxes import GrownBox
+
     box, samples, attempts = torch.zeros(1), 50, 4
     shares = np.arange(samples + 1)
     ours = np.array([GrownBox(box, box, box, int(k), samples, samples).interval for k in shares])

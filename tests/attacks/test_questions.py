@@ -17,7 +17,6 @@ from advsearch.attacks.candidates import (
     scale_domain,
     shrink_towards_start,
 )
-from advsearch.questions.region.boxes import grow_box
 
 NORMS = {"linf": lambda w: float(w.abs().sum()), "l2": lambda w: float(w.norm())}
 
@@ -71,7 +70,10 @@ def test_an_end_that_passed_by_luck_moves_out_until_it_passes_again() -> None:
     assert confirm_bracket(nothing, lambda u, _: False, domain) is nothing
 
 
+@pytest.mark.island("advsearch.questions.region")
 def test_a_region_fills_the_box_in_which_the_prediction_stays() -> None:
+    from advsearch.questions.region.boxes import grow_box
+
     low, high = torch.tensor([0.2, 0.0, 0.3]), torch.tensor([0.7, 1.0, 0.6])
     region = grow_box(lambda u, _: bool(((u >= low) & (u <= high)).all()), torch.tensor([0.5, 0.5, 0.4]), seed=1)
     assert bool((region.low >= low).all()) and bool((region.high <= high).all())
@@ -79,7 +81,10 @@ def test_a_region_fills_the_box_in_which_the_prediction_stays() -> None:
     assert region.n_same == region.samples == 200 and region.interval[0] > 0.97
 
 
+@pytest.mark.island("advsearch.questions.region")
 def test_a_region_in_a_disc_keeps_what_it_promises() -> None:
+    from advsearch.questions.region.boxes import grow_box
+
     centre = torch.tensor([0.5, 0.45])
     region = grow_box(lambda u, _: float((u - 0.5).norm()) < 0.3, centre, seed=3)
     points = torch.lerp(region.low, region.high, torch.rand(20_000, 2, generator=torch.Generator().manual_seed(9)))

@@ -13,6 +13,8 @@ from scenes.environments import ENVIRONMENTS
 from scenes.environments.panorama import HEIGHT, LEVEL, brightness, directions, irradiance
 from scenes.places import PLACES, place_files
 
+pytestmark = pytest.mark.island("advsearch.questions.harden")
+
 SEEDS = (None, 1, 2, 3)  # None is the canonical instance
 INSTANCES = [pytest.param(name, seed, id=f"{name}-{seed}") for name in sorted(OBJECTS) for seed in SEEDS]
 

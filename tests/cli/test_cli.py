@@ -14,12 +14,11 @@ import pytest
 
 import samples
 from advsearch.cli.main import list_commands, main
+from advsearch.config import CONFIGS
 from advsearch.errors import InputError, StorageError
 from advsearch.options import Value
 from advsearch.progress import Progress
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.region.result import RegionConfig
-from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.settings import Config
@@ -84,7 +83,8 @@ def test_every_command_has_help_and_json(command: str, capsys: pytest.CaptureFix
     ("argv", "named"),
     [
         (["atack"], "'attack'"), (["attack", "--epsilom", "1"], "'--epsilon'"),
-        (["region", "--workers", "2"], "--workers"), (["attack", "--object", "mug", "--epsilon", "nan"], "--epsilon: "),
+        pytest.param(["region", "--workers", "2"], "--workers", marks=pytest.mark.island("advsearch.questions.region")),
+        (["attack", "--object", "mug", "--epsilon", "nan"], "--epsilon: "),
         (["attack", "--object", "mug", "--set", "a"], "--set: "), (["run", "no.yaml"], "no.yaml: "),
         (["show", "no-run"], "'no-run'"),
     ],
@@ -195,18 +195,20 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("config", "answer"),
+    ("command", "given", "make_answer"),
     [
-        (AttackConfig(object="mug", run="stopped"), SUMMARY),
-        (AttackConfig(object="mug,bowl", run="stopped"), samples.curve()),
-        (RegionConfig(object="mug", run="stopped"), samples.region()),
-        (SweepConfig(object="mug", grid={"pose.yaw": [1, 2]}, run="stopped"), samples.sweep()),
+        ("attack", {"object": "mug"}, lambda: SUMMARY),
+        ("attack", {"object": "mug,bowl"}, samples.curve),
+        pytest.param(
+            "region", {"object": "mug"}, samples.region, marks=pytest.mark.island("advsearch.questions.region")
+        ),
+        ("sweep", {"object": "mug", "grid": {"pose.yaw": [1, 2]}}, samples.sweep),
     ],
-    ids=lambda value: value.command if isinstance(value, Config) else "",
 )
 def test_resume_goes_on_with_what_was_stopped(
-    api: Callable[..., None], runs: Path, config: Config, answer: Any
+    api: Callable[..., None], runs: Path, command: str, given: dict[str, Any], make_answer: Callable[[], Any]
 ) -> None:
+    config, answer = CONFIGS[command](**given, run="stopped"), make_answer()
     with RunDirectory.create_for(config) as run:
         run.append_rows(Row("search", 0))
     found: list[Any] = []

@@ -14,7 +14,6 @@ import pytest
 import yaml
 
 import advsearch
-from advsearch import testing
 from advsearch.cli.main import list_commands, main
 from advsearch.cluster import WorkerTask
 from advsearch.cluster.worker import run_batch
@@ -22,8 +21,6 @@ from advsearch.errors import InputError
 from advsearch.questions.attack.carry_out import load_parts_of_run
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import make_chain_worker
-from advsearch.questions.photographs.carry_out import Photographs
-from advsearch.questions.photographs.pages import PhotographPages
 from advsearch.runs.directory import RunDirectory
 from advsearch.settings import HEADER
 from advsearch.trust.code import allow_code_in_settings, allowed_code, restrict_allowed_code
@@ -124,6 +121,7 @@ ALONE = (
 """Those that are told everything, and the dashboard, which is tried below."""
 
 
+@pytest.mark.island("all")
 def test_every_command_is_tried_here() -> None:
     assert {*IMPORTING, *READING, *ALONE, "dashboard"} == {*list_commands()}
 
@@ -183,14 +181,20 @@ def explained() -> None:
     raise InputError(" ".join(advsearch.explain("swept", confirm=0, pairs=0, clusters=4).warnings))
 
 
+def add_photograph() -> None:
+    from advsearch.questions.photographs.carry_out import Photographs
+
+    Photographs().add(Path("runs/kept"), "0", photograph())
+
+
 PYTHON: dict[str, Callable[[], object]] = {
     "a loaded run": lambda: load_parts_of_run(Path("runs/theirs")),
     "sweep": lambda: advsearch.sweep(adversarial_of="theirs", controls=["light"], samples=2),
     "replay": lambda: advsearch.replay("theirs"),
     "explain": explained,
     "recipe": lambda: advsearch.recipe("./recipe.yaml"),
-    "assert_suite": lambda: testing.assert_suite("suite.yaml"),
-    "a thread": lambda: Photographs().add(Path("runs/kept"), "0", photograph()),
+    "assert_suite": lambda: advsearch.testing.assert_suite("suite.yaml"),
+    "a thread": add_photograph,
     "a worker": in_a_worker,
     "a worker of a study": lambda: make_chain_worker(
         AttackConfig(object="mug,bowl", model=NAME, controls={"pose": {}}).to_json()
@@ -198,12 +202,24 @@ PYTHON: dict[str, Callable[[], object]] = {
 }
 
 
+NEEDED = {
+    "replay": pytest.mark.island("advsearch.questions.replay"),
+    "explain": pytest.mark.island("advsearch.questions.explain"),
+    "recipe": pytest.mark.island("advsearch.questions.recipe"),
+    "assert_suite": pytest.mark.island("advsearch.questions.test"),
+    "a thread": pytest.mark.island("advsearch.questions.photographs"),
+}
+"""What such a function needs beyond the core."""
+
+FUNCTIONS = [pytest.param(name, marks=NEEDED.get(name, ())) for name in PYTHON]
+
+
 def photograph() -> bytes:
     return next(Path("runs/kept").rglob("*.jpg")).read_bytes()
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("name", PYTHON)
+@pytest.mark.parametrize("name", FUNCTIONS)
 def test_a_function_imports_what_its_caller_names_alone(name: str) -> None:
     with pytest.raises(InputError, match=rf"a file names {NAME}, Python code from .*allow_code\('{NAME}'\)"):
         PYTHON[name]()
@@ -214,8 +230,11 @@ def test_a_function_imports_what_its_caller_names_alone(name: str) -> None:
     assert Path("imported").exists()
 
 
+@pytest.mark.island("advsearch.questions.photographs")
 @pytest.mark.medium
 def test_the_dashboard_imports_nothing_for_a_photograph() -> None:
+    from advsearch.questions.photographs.pages import PhotographPages
+
     with pytest.raises(InputError, match=NAME):
         PhotographPages()._photographs.add(Path("runs/kept"), "0", photograph())
     assert not Path("imported").exists()

@@ -66,6 +66,7 @@ def written(command: str, **given: Any) -> Path:
     return Path("a.yaml")
 
 
+@pytest.mark.island("advsearch.questions.test")
 def test_every_setting_that_reaches_beyond_the_run_says_so() -> None:
     """A new setting that names a place to write, or who shares the work, is declared with what it does there."""
     assert {name for _, name in CASES} == {*POWERS}
@@ -141,6 +142,7 @@ def test_a_run_goes_on_without_and_says_what_to_type(
     assert [(one.cluster, one.log, one.workers) for one in seen] == [(None, None, None), ("cluster.yaml", None, 2)]
 
 
+@pytest.mark.island("advsearch.questions.test")
 def test_what_decides_numbers_is_not_left_out_but_refused(capsys: pytest.CaptureFixture[str]) -> None:
     Path("runs/sent").mkdir(parents=True)
     Path("suite.yaml").write_text("settings: {object: mug}\nclaims: {a: {claim: not_broken}}\n")
@@ -150,6 +152,7 @@ def test_what_decides_numbers_is_not_left_out_but_refused(capsys: pytest.Capture
     assert "add: changes what is kept beside the suite, which a file can't ask for; type add=theirs" in error
 
 
+@pytest.mark.island("advsearch.questions.test")
 @pytest.mark.medium
 def test_resume_writes_none_of_the_files_that_a_run_names(capsys: pytest.CaptureFixture[str]) -> None:
     Path("runs/sent").mkdir(parents=True)

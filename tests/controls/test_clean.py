@@ -22,16 +22,19 @@ def space_of(scene: SceneDescription, **controls: dict[str, Any]) -> Space:
     return make_space([make_control(name, given) for name, given in controls.items()], scene)
 
 
-REFUSED: list[tuple[dict[str, float], str, dict[str, Any], str]] = [
+REFUSED: list[Any] = [
     ({"camera.elevation": 80.0}, "studio", {"camera": {"elevation": [5, 30]}}, "--set camera.elevation=80"),
     ({"pose.yaw": 0.0}, "studio", {"pose": {"yaw": {"choices": [10, 20]}}}, "pose.yaw is one of 10, 20"),
     ({"pose.yaw": 10.0}, "studio", {"mine": {"kind": "pose", "yaw": [20, 30]}}, "--control mine"),
     ({"camera.fov": 50.0}, "studio", {"camera": {"focal_length": [10, 20]}}, "38.6"),
     ({}, "loft", {"environment": {"which": ["noon", "kitchen"]}}, "--environment loft"),
-    ({}, "loft", {"sky": {}}, "--control sky"),
-    ({"ground.size": 5.0}, "studio", {"background": {}}, "--set ground.size=5"),
+    pytest.param({}, "loft", {"sky": {}}, "--control sky", marks=pytest.mark.island("advsearch.controls.sky")),
+    pytest.param(
+        {"ground.size": 5.0}, "studio", {"background": {}}, "--set ground.size=5",
+        marks=pytest.mark.island("advsearch.controls.background"),
+    ),
     ({"material.roughness": 0.9}, "studio", {"material": {"which": ["wood", "marble"]}}, "--set material.roughness"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("given", "environment", "controls", "named"), REFUSED)
@@ -53,9 +56,12 @@ def test_a_control_that_leaves_out_what_was_asked_for_is_refused(
         ({"camera.fov": 50.0}, "studio", {"camera": {"focal_length": [30, 60]}}),
         ({}, "noon", {"environment": {"which": ["kitchen", "noon"]}}),
         ({}, "loft", {"environment": {"which": ["own", "noon"]}}),
-        ({"ground.size": 5.0}, "studio", {"background": {"ground": "keep", "what": ["environment", "colour"]}}),
+        pytest.param(
+            {"ground.size": 5.0}, "studio", {"background": {"ground": "keep", "what": ["environment", "colour"]}},
+            marks=pytest.mark.island("advsearch.controls.background"),
+        ),
     ],
-)
+)  # fmt: skip
 def test_a_control_that_agrees_starts_at_what_was_asked_for(
     given: dict[str, float], environment: str, controls: dict[str, Any]
 ) -> None:
@@ -73,7 +79,9 @@ def test_an_environment_that_is_chosen_is_the_environment(environment: str) -> N
     scene = advsearch.load_scene("mug", own)
     chosen = scene.renderer({"environment": {"which": ["own", "noon", "kitchen"]}}, resolution=16, denoise="none")
     u = torch.tensor([0.5 if environment == "noon" else 0.9])
-    plain = advsearch.load_scene("mug", environment).renderer({"lens": {}}, resolution=16, denoise="none")
+    plain = advsearch.load_scene("mug", environment).renderer(
+        {"camera": {"roll": [-1, 1]}}, resolution=16, denoise="none"
+    )
     difference = chosen(u, seed=1, spp=4) - plain(plain.start, seed=1, spp=4)
     assert float(difference.abs().max()) < 0.1 / 255.0
     assert bool(torch.isfinite(chosen.gradient(torch.mean, u, 0, 2)[1]).all())

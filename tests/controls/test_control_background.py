@@ -10,6 +10,8 @@ import advsearch
 from advsearch.controls.background import BackgroundControl, hsv_to_rgb
 from advsearch.scene.description import SceneDescription
 
+pytestmark = pytest.mark.island("advsearch.controls.background")
+
 
 def test_the_colours_are_those_of_the_standard_library() -> None:
     for hue, saturation, value in itertools.product(

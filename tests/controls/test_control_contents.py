@@ -13,6 +13,8 @@ from advsearch.scene.assets import Mesh, ObjectAsset
 from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.library import load_object
 
+pytestmark = pytest.mark.island("advsearch.controls.contents")
+
 AGREEMENT = 0.1
 """Relative difference allowed between 64-sample adjoints and 128-sample differences."""
 

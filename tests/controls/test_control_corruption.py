@@ -19,7 +19,7 @@ DRAWN = ("shot_noise", "impulse_noise")
 """Their derivative is one of the average over draws."""
 
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.island("advsearch.controls.corruption")]
 
 
 def scenery(height: int = 48, width: int = 64) -> Tensor:

@@ -67,7 +67,7 @@ def stopped_run(**settings: object) -> None:
     ("settings", "named"),
     [
         ({"model": "planted:make@weights.safetensors"}, "planted:make"),
-        ({"model": "torchvision:resnet18"}, ""),
+        pytest.param({"model": "torchvision:resnet18"}, "", marks=pytest.mark.island("advsearch.models.zoo")),
         ({"model": "planted:make", "over": {"planted:Fade": {}}}, "planted:make planted:Fade"),
     ],
 )
@@ -95,7 +95,14 @@ def test_how_to_go_on_names_the_code_that_is_needed(
         ({"over": {"planted:Fade": {}}}, "planted:Fade"),
     ],
 )  # fmt: skip
-@pytest.mark.parametrize("command", ["resume theirs", "run runs/theirs/run.yaml", "region --around theirs"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        "resume theirs",
+        "run runs/theirs/run.yaml",
+        pytest.param("region --around theirs", marks=pytest.mark.island("advsearch.questions.region")),
+    ],
+)
 def test_code_that_somebody_elses_file_names_is_not_run(
     command: str, settings: dict[str, object], name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

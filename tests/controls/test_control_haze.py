@@ -16,6 +16,8 @@ from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.parts import HazePart
 
+pytestmark = pytest.mark.island("advsearch.controls.haze")
+
 SIDE = 32
 WHITE = [1.0, 1.0, 1.0]
 

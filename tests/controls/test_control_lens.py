@@ -10,6 +10,8 @@ from advsearch.controls.lens import LensControl, draw_dots
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
 
+pytestmark = pytest.mark.island("advsearch.controls.lens")
+
 NAMES = ("x", "y", "radius", "red", "green", "blue", "opacity", "falloff")
 
 

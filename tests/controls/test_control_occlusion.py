@@ -22,6 +22,8 @@ from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.raster import rasterize_triangles
 
+pytestmark = pytest.mark.island("advsearch.controls.occlusion")
+
 ACCURACY = 0.02
 """Allowed error of a hidden share: silhouettes have 128 pixels along their longer side."""
 

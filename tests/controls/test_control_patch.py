@@ -19,6 +19,8 @@ from advsearch.scene.raster import MeshSurface, rasterize_charts
 from covering import only
 from small_models import assert_slope
 
+pytestmark = pytest.mark.island("advsearch.controls.patch")
+
 SIDE = 512
 
 

@@ -21,6 +21,8 @@ from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.geometry import camera_to_world, compute_center, compute_object_to_world
 from advsearch.tasks import Facts
 
+pytestmark = pytest.mark.island("advsearch.controls.path")
+
 WAY = "time, x, y, z\n3, 2, 0, 1\n4, 2, 2, 1\n7, -2, 2, 1\n"
 """A way of four seconds; the middle one is passed after one of them."""
 

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.cli.exporters.projection.images import write_projection
 from advsearch.controls import make_control
 from advsearch.controls.projector.projector import DEFAULT_AMBIENT_LUX, ProjectorControl
 from advsearch.controls.space import Space
@@ -25,6 +24,8 @@ from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.lights import BasisRenderer, make_predictor
 from samples import make_attacked
+
+pytestmark = pytest.mark.island("advsearch.controls.projector")
 
 DARK = EnvironmentAsset("dark", np.zeros((4, 8, 3), np.float32))
 SIDE = 32
@@ -175,8 +176,11 @@ def test_the_stored_png_throws_the_same_picture_and_texels_have_eight_bits(tmp_p
     assert torch.equal(renderer(u, seed=5, spp=8), again(torch.ones(1), seed=5, spp=8))
 
 
+@pytest.mark.island("advsearch.cli.exporters.projection")
 @pytest.mark.medium
 def test_the_export_has_the_picture_marks_and_what_to_set(tmp_path: Path) -> None:
+    from advsearch.cli.exporters.projection.images import write_projection
+
     settings: dict[str, Any] = {"resolution": 4, "lumens": 10}
     config = AttackConfig(object="mug", controls={"projector": settings}, resolution=16)
     u = np.linspace(0.0, 1.0, 4 * 4 * 3)

@@ -10,6 +10,8 @@ from advsearch.controls.sensor import SensorControl, apply_aberration, apply_mos
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
 
+pytestmark = pytest.mark.island("advsearch.controls.sensor")
+
 NAMES = ("vignetting", "aberration", "shot", "read", "mosaic", "red", "blue", "compression")
 
 

@@ -17,6 +17,8 @@ from advsearch.scene.geometry import camera_to_world, compute_center
 from advsearch.scene.parts import make_polygon
 from advsearch.scene.renderer import Renderer
 
+pytestmark = pytest.mark.island("advsearch.controls.shadow")
+
 SIDE = 32
 
 

@@ -21,6 +21,8 @@ from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 
+pytestmark = pytest.mark.island("advsearch.controls.sky")
+
 PLUGIN_UNIT = 106.750
 """Mitsuba divides by the integral of the CIE luminosity function; maps here do not."""
 SKIES = ((20.0, 45.0, 3.0, 1e-3), (200.0, 80.0, 10.0, 1e-3), (120.0, 12.0, 7.0, 1e-3), (120.0, 12.0, 6.7, 0.03))

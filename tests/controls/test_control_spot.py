@@ -13,6 +13,8 @@ from advsearch.controls.projector.projector import blur_light
 from advsearch.controls.space import Space
 from advsearch.scene.renderer import Renderer
 
+pytestmark = pytest.mark.island("advsearch.controls.projector")
+
 SIDE = 24
 NUMBERS = ("x", "y", "width", "red", "green", "blue", "lumens")
 THERE = torch.tensor([0.55, 0.45, 0.7, 0.9, 0.6, 0.4, 0.5])

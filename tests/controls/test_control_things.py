@@ -14,7 +14,7 @@ from advsearch.scene.assembly import InputAssembler
 from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.geometry import compute_footprint, is_overlapping
 
-pytestmark = pytest.mark.usefixtures("two_threads")
+pytestmark = [pytest.mark.usefixtures("two_threads"), pytest.mark.island("advsearch.controls.things")]
 
 THINGS = "chair@4,0,size=1; stop-sign@4.5,2; car@-6,0.5,heading=30"
 CLOSE = 2e-4

@@ -7,7 +7,6 @@ import torch
 
 import advsearch
 from advsearch.controls import CONTROLS, compose_space, make_control
-from advsearch.controls.corruption import CORRUPTION_NAMES
 from conftest import ROOT
 from elsewhere import ELSEWHERE, Away, elsewhere
 from samples import load_photographed_box
@@ -30,11 +29,15 @@ FORMS: dict[str, tuple[dict[str, Any], ...]] = {
     "lens": ({}, {"dots": 2, "opacity": [0.2, 0.9]}),
     "sensor": ({"shot": [0.0, 0.2], "mosaic": [0, 1], "compression": [0, 80], "aberration": [0.0, 0.02]},),
     "mitsuba": ({"ground.bsdf.brdf_0.reflectance.value": [0.1, 0.9]},),
-    "corruption": tuple(
-        {"which": which, "severity": severity} for which in CORRUPTION_NAMES for severity in ([0.2, 0.9], [3.2, 4.9])
-    ),
 }  # fmt: skip
 """Settings under which a control takes all its ways; it is tried with none where it is not here."""
+
+if "corruption" in CONTROLS:
+    from advsearch.controls.corruption import CORRUPTION_NAMES
+
+    FORMS["corruption"] = tuple(
+        {"which": which, "severity": severity} for which in CORRUPTION_NAMES for severity in ([0.2, 0.9], [3.2, 4.9])
+    )
 
 CASES = [
     pytest.param(kind, given, id=f"{kind}-{number}")

@@ -13,7 +13,7 @@ from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 from advsearch.scene.mitsuba_backend.writing import write_scene, write_xml
 from advsearch.scene.mitsuba_backend.xml_files import read_scene
 
-pytestmark = pytest.mark.usefixtures("two_threads")
+pytestmark = [pytest.mark.usefixtures("two_threads"), pytest.mark.island("advsearch.controls.mitsuba")]
 
 RED, GLOW, WIDE = "red.reflectance.value", "light.emitter.radiance.value", "camera.x_fov"
 SIZE = 16

@@ -17,7 +17,7 @@ from advsearch.models import ModelWarning
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.scene.description import load_description
 
-pytestmark = pytest.mark.medium
+pytestmark = [pytest.mark.medium, pytest.mark.island("advsearch.controls.path")]
 
 transformers = pytest.importorskip("transformers")
 

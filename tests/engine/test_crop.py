@@ -156,8 +156,14 @@ def test_the_window_is_chosen_by_what_changes_outside(monkeypatch: pytest.Monkey
     [
         ({"controls": {"camera": {}}}, "camera shows in more than a part"),
         ({"controls": {"environment": {}}}, "environment is light"), ({"controls": {"pose": {}}}, "object moves"),
-        ({"controls": {"material": {}, "haze": {}}}, "there is haze"),
-        ({"controls": {"lens": {}}}, "nothing that is searched needs a render"),
+        pytest.param(
+            {"controls": {"material": {}, "haze": {}}}, "there is haze",
+            marks=pytest.mark.island("advsearch.controls.haze"),
+        ),
+        pytest.param(
+            {"controls": {"lens": {}}}, "nothing that is searched needs a render",
+            marks=pytest.mark.island("advsearch.controls.lens"),
+        ),
         ({"steps": 15}, "pays from 16 evaluations on"),
         ({"over": ["camera"]}, "the surroundings of each picture are others"),
         ({"denoise": "none"}, "noise is part of the picture"),

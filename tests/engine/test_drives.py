@@ -15,7 +15,6 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.engine.journal import make_worker_call
 from advsearch.progress import NullProgress
-from advsearch.questions.explain.rows import read_predictions
 from advsearch.questions.sweep import job as swept_scene
 from advsearch.questions.sweep.carry_out import load_job
 from advsearch.questions.sweep.drives import summarize_drives
@@ -69,6 +68,7 @@ def clocked(right: str, **given: Any) -> tuple[list[DriveRates], Any]:
 DRIVE: dict[str, Any] = {"controls": {"path": {"seconds": 4.0, "reach": 5.0}}, "path": "approach", "fps": 1.0}
 
 
+@pytest.mark.island("advsearch.controls.path")
 @pytest.mark.parametrize(
     ("frames", "right", "gap", "flicker", "first"),
     [
@@ -87,6 +87,7 @@ def test_rates_of_one_drive_are_those_worked_out_by_hand(
     assert (said.first_right and said.first_right.mean) == (None if first is None else pytest.approx(first, abs=1e-3))
 
 
+@pytest.mark.island("advsearch.controls.path")
 @pytest.mark.medium
 @pytest.mark.parametrize("workers", [False, True])
 def test_frames_of_a_drive_of_both_have_their_distances_and_workers_have_the_same(
@@ -105,6 +106,7 @@ def test_frames_of_a_drive_of_both_have_their_distances_and_workers_have_the_sam
     assert away == pytest.approx({0.0: 14.0, 1.0: 11.0, 2.0: 8.0, 3.0: 5.0, 4.0: 2.0}, abs=1e-4)
 
 
+@pytest.mark.island("advsearch.controls.path")
 @pytest.mark.medium
 @pytest.mark.parametrize(
     ("grid", "samples"), [({}, 3), ({"path.time": [0, 4, 2], "pose.yaw": [0, 90]}, 1), ({"pose.yaw": [0, 90]}, 3)]
@@ -132,6 +134,7 @@ CONFIG = SweepConfig(
 )  # fmt: skip
 
 
+@pytest.mark.island("advsearch.controls.path")
 @pytest.mark.medium
 def test_resumed_and_shared_drives_are_those_of_one_who_did_it_alone(tmp_path: Path) -> None:
     with RunDirectory.create(tmp_path / "alone") as run:
@@ -166,6 +169,7 @@ def test_intervals_over_drives_cover_the_mean_of_few_drives(drives: int, kind: s
 REPEATED: dict[str, Any] = {**DRIVE, "samples": 6}
 
 
+@pytest.mark.island("advsearch.controls.path")
 @pytest.mark.medium
 def test_repeats_of_one_drive_that_differ_in_noise_are_one_drive(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -194,9 +198,13 @@ def swept_parts(folder: Path, *settings: dict[str, Any]) -> list[StoredSweep]:
     return [StoredSweep.read(path) for path in paths]
 
 
+@pytest.mark.island("advsearch.questions.explain")
+@pytest.mark.island("advsearch.controls.sensor")
 @pytest.mark.medium
 def test_pictures_of_a_longer_sweep_of_the_same_seed_are_not_counted_twice(tmp_path: Path) -> None:
     """Draws of one seed are the same ones, also where a setting makes other pictures of them."""
+    from advsearch.questions.explain.rows import read_predictions
+
     drawn: dict[str, Any] = {"controls": {"sensor": {"shot": [0.0, 0.15]}}}
     short, long, other = swept_parts(
         tmp_path, *({**drawn, "samples": samples, "seed": seed} for samples, seed in ((6, 3), (9, 3), (6, 4)))
@@ -209,6 +217,7 @@ def test_pictures_of_a_longer_sweep_of_the_same_seed_are_not_counted_twice(tmp_p
     assert (len(mixed), mixed["unit"].nunique()) == (15, 9), "other settings: other predictions of the same draws"
 
 
+@pytest.mark.island("advsearch.controls.path")
 @pytest.mark.medium
 def test_an_attack_over_a_path_keeps_its_adversarial_scene_along_the_drive(tmp_path: Path) -> None:
     path = tmp_path / "run"

@@ -13,7 +13,7 @@ from advsearch.tasks.base import Facts, Sight
 from advsearch.tasks.segmentation import Segmentation
 from advsearch.tasks.together import make_each_thing_task
 
-pytestmark = pytest.mark.usefixtures("two_threads")
+pytestmark = [pytest.mark.usefixtures("two_threads"), pytest.mark.island("advsearch.tasks.segmentation")]
 
 VIEW = {"camera.distance": 9.0, "camera.azimuth": 0.0, "camera.elevation": 12.0, "camera.fov": 60.0}
 ASKED: dict[str, Any] = {

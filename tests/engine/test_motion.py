@@ -15,6 +15,8 @@ from advsearch.scene.description import load_description
 from advsearch.scene.formation import Moment, divide_exposure
 from advsearch.scene.renderer import Renderer
 
+pytestmark = pytest.mark.island("advsearch.controls.path")
+
 SIDE, SECONDS = 48, 2.0
 LEVELS = 2.0 / 255.0
 DRIVE: dict[str, Any] = {"path": "orbit", "seconds": SECONDS, "time": 0.9}

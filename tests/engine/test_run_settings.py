@@ -33,16 +33,18 @@ def test_an_epsilon_for_one_control_leaves_the_others_their_own() -> None:
     ("controls", "options", "message"),
     [
         ("pose", {"epsilon": 0.1}, "--epsilon pose: the control has ranges and no epsilon; give its ranges, as in"),
-        (
+        pytest.param(
             "pose,lens",
             {"norm": "l2"},
             "--norm: the control pose does not take it, nor does another one here; leave it out",
+            marks=pytest.mark.island("advsearch.controls.lens"),
         ),
-        (
+        pytest.param(
             {"patch": {"picture": "a.png", "azimuth": [0, 360]}},
             {"epsilon": 0.1},
             "--epsilon patch: the control has ranges and no epsilon; give its ranges, as in --control "
             "'patch={PARAMETER: [LOW, HIGH]}', or search pixels with it",
+            marks=pytest.mark.island("advsearch.controls.patch"),
         ),
     ],
 )

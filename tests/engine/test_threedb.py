@@ -34,6 +34,7 @@ LINE = {
 }  # fmt: skip
 
 
+@pytest.mark.island("advsearch.cli.exporters.threedb")
 def test_a_sweep_is_written_as_its_dashboard_reads_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = make_sweep(tmp_path / "run", keep="wrong")
     out = tmp_path / "out"
@@ -51,6 +52,7 @@ def test_a_sweep_is_written_as_its_dashboard_reads_it(tmp_path: Path, capsys: py
     assert "not empty" in capsys.readouterr().err
 
 
+@pytest.mark.island("advsearch.cli.exporters.threedb")
 def test_3dbs_own_dashboard_opens_what_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its program, up to where it would listen."""
     pytest.importorskip("threedboard", reason="no threedboard here: pip install threedboard")
@@ -70,6 +72,7 @@ def test_3dbs_own_dashboard_opens_what_is_written(tmp_path: Path, monkeypatch: p
         assert picture.data[:4] == b"\x89PNG"
 
 
+@pytest.mark.island("advsearch.cli.exporters.threedb")
 def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     run = make_sweep(tmp_path / "run", keep="all")
     main(["export", str(run), "--format", "3db", "--out", str(tmp_path / "out")])

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from check_docs import DOCS, blocks
 from PIL import Image
 
 import advsearch
@@ -25,6 +24,8 @@ from advsearch.models import address
 from advsearch.tasks import make_task
 from advsearch.trust.code import restrict_allowed_code
 from advsearch.trust.network import KEY, check_address
+
+pytestmark = pytest.mark.island("advsearch.models.address", "advsearch.tasks.answers")
 
 SECRET = "sk-very-secret"
 SMALL = ["--object", "mug", "--resolution", "24", "--spp", "2", "--verify-spp", "4", "--trials", "6", "--quiet"]
@@ -105,9 +106,12 @@ def chat(text: str, **more: Any) -> Callable[[dict[str, Any]], dict[str, Any]]:
     return lambda asked: {"choices": [{"message": {"content": text}}], "usage": usage, **more}
 
 
+@pytest.mark.island("all")
 @pytest.mark.medium
 def test_the_server_of_the_page_is_the_model_behind_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its logits are those of the model that it asks, of a picture of 8 bits, up to a constant of each picture."""
+    from check_docs import DOCS, blocks
+
     (block,) = blocks(DOCS / "addresses.md", "python")
     names: dict[str, Any] = {"__name__": "page"}
     exec(compile(block, "addresses.md", "exec"), names)

@@ -13,6 +13,8 @@ from advsearch import load_model
 from advsearch.tasks.depth import DISPARITY, METRIC, Depth, DepthTruth
 from small_models import assert_slope
 
+pytestmark = pytest.mark.island("advsearch.tasks.depth")
+
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 
 SIDE = 32
@@ -69,6 +71,7 @@ def published(folder: Path, family: str) -> str:
     return f"hf:{folder}"
 
 
+@pytest.mark.island("advsearch.models.zoo")
 @pytest.mark.medium
 @pytest.mark.parametrize(
     ("family", "kind"),
@@ -92,6 +95,7 @@ def test_maps_are_the_librarys(tmp_path: Path, family: str, kind: str) -> None:
     assert float((at_size - asked).abs().max()) < 1e-4 * max(1.0, float(asked.abs().max()))
 
 
+@pytest.mark.island("advsearch.models.zoo")
 def test_the_gradient_of_a_network_agrees_with_differences(tmp_path: Path) -> None:
     model: Any = load_model(published(tmp_path, "DepthAnything"), task="depth")
     mask = torch.zeros(SIDE, SIDE).bool()

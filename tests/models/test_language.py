@@ -16,6 +16,8 @@ from advsearch.models import Model, load_model
 from advsearch.models.zoo import transformers as own
 from small_models import loud
 
+pytestmark = pytest.mark.island("advsearch.models.zoo")
+
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 
 TORCHVISION = importlib.util.find_spec("torchvision") is not None

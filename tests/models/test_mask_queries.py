@@ -19,7 +19,7 @@ SIDE = 64
 NAMES = ("mug", "bowl", "vase")
 PICTURE = torch.rand((SIDE, SIDE, 3), generator=torch.Generator().manual_seed(0)).mul(255).round() / 255
 WARNED = pytest.mark.filterwarnings("ignore:.*margins are logarithms of a ratio of scores")
-pytestmark = WARNED
+pytestmark = [WARNED, pytest.mark.island("advsearch.tasks.segmentation")]
 ROUNDED = pytest.mark.filterwarnings("ignore:.*sees an image differently in a batch")
 """Of a grey picture group normalisation divides rounding by next to nothing, which random weights make much of."""
 SWIN = {"image_size": SIDE, "patch_size": 4, "embed_dim": 4, "depths": [1] * 4, "num_heads": [1] * 4, "window_size": 2}
@@ -84,6 +84,7 @@ def published(folder: Path, family: str) -> str:
     return f"hf:{folder}"
 
 
+@pytest.mark.island("advsearch.models.zoo")
 @pytest.mark.medium
 @ROUNDED
 @pytest.mark.parametrize("family", SIZES)
@@ -111,6 +112,7 @@ def test_pixels_have_the_librarys_scores(tmp_path: Path, family: str) -> None:
     assert ours.argmax(dim=0).equal(theirs.segmentation) and float(ours.std()) > 0.01
 
 
+@pytest.mark.island("advsearch.models.zoo")
 def test_the_gradient_agrees_with_differences(tmp_path: Path) -> None:
     """Along a direction, of MaskFormer: the attention of the others has thresholds."""
     model: Any = load_model(published(tmp_path, "MaskFormer"), task="segmentation")

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import reference_training as training
 import torch
 from torch import Tensor, nn
 
@@ -434,7 +433,10 @@ def test_callables_that_are_errors(nets: Path, spec: str, named: str) -> None:
     sys.modules.pop("my_nets", None)
 
 
+@pytest.mark.island("advsearch.questions.harden")
 def test_reference_is_stored_and_loaded(tmp_path: Path) -> None:
+    import reference_training as training
+
     net = reference.build(3)
     state = training.with_temperature(net.state_dict(), 2.0)
     weights, record = training.save(tmp_path, state, ["mug", "bowl", "vase"], {"accuracy": 0.9})

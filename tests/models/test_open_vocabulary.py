@@ -14,6 +14,8 @@ from advsearch import load_model
 from advsearch.models import Model
 from small_models import SMALL_ATTACK, assert_slope
 
+pytestmark = pytest.mark.island("advsearch.models.zoo")
+
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 
 NAMES = ("mug", "coffee cup", "bowl")

@@ -21,7 +21,10 @@ class Answers(nn.Module):
         return self.form(self.pixels(x))
 
 
-@pytest.mark.parametrize("task", ["classification", "segmentation"])
+@pytest.mark.parametrize(
+    "task",
+    ["classification", pytest.param("segmentation", marks=pytest.mark.island("advsearch.tasks.segmentation"))],
+)
 @pytest.mark.parametrize(
     "form",
     [lambda pixels: pixels.argmax(dim=1), lambda pixels: {"logits": pixels.argmax(dim=1).int()}],

@@ -18,6 +18,8 @@ from advsearch.models.zoo.transformers import HUB_TIMEOUT
 from advsearch.tasks import Detection
 from advsearch.tasks.boxes import DetectionTruth
 
+pytestmark = pytest.mark.island("advsearch.models.zoo")
+
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 huggingface_hub = pytest.importorskip("huggingface_hub")
 

@@ -28,7 +28,7 @@ READS = {
     "attention_dropout": 0.5,
 }
 SIGLIP = pytest.mark.filterwarnings("ignore:.*scores each name independently")
-pytestmark = SIGLIP
+pytestmark = [SIGLIP, pytest.mark.island("advsearch.models.zoo")]
 
 
 def tokenizer() -> Any:

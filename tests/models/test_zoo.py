@@ -22,6 +22,8 @@ from advsearch.tasks import Detection
 from advsearch.trust.code import allow_code_in_settings, restrict_allowed_code
 from fuzz import onnx_files
 
+pytestmark = pytest.mark.island("advsearch.models.zoo")
+
 IMAGES = torch.rand((2, 8, 8, 3), generator=torch.Generator().manual_seed(0))
 
 

@@ -30,6 +30,7 @@ CORE_PARTS = {
 """Parts that are not removed, those in their modules included."""
 
 
+@pytest.mark.island("all")
 def test_every_part_of_the_catalog_is_there_and_is_what_it_says() -> None:
     for part in BUILT_INS:
         assert is_module_installed(part.import_path.partition(":")[0]), part
@@ -130,6 +131,7 @@ def test_without_all_removable_parts_the_tool_works(tmp_path: Path) -> None:
     assert [status for status, _, _ in done] == [0, 0, 0], done
 
 
+@pytest.mark.island("all")
 def test_no_control_imports_another_one() -> None:
     modules = {part.import_path.partition(":")[0] for part in BUILT_INS if part.kind == "control"}
     found = set()

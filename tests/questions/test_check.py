@@ -24,6 +24,8 @@ from advsearch.runs.measurements import Measurements
 from advsearch.runs.results import PathLength, Result
 from advsearch.runs.summary import read_result
 
+pytestmark = pytest.mark.island("advsearch.questions.check")
+
 FLAGS = "check --object mug --control camera.azimuth,environment.rotation --loss linear --resolution 16 --spp 1"
 SMALL: dict[str, Any] = {
     "object": "mug",

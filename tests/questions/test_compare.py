@@ -27,6 +27,8 @@ from advsearch.viewer import thumbnails
 from samples import make_run, sweep
 from stored_sweeps import described
 
+pytestmark = pytest.mark.island("advsearch.questions.compare")
+
 PICTURES = 400
 EDGES_OF_ELEVATION = (5.0, 25.0, 45.0, 65.0, 85.0)
 

@@ -23,6 +23,8 @@ from advsearch.scene.parts import HazePart
 from advsearch.scene.renderer import Renderer
 from advsearch.trust.programs import BLENDER
 
+pytestmark = pytest.mark.island("advsearch.questions.replay")
+
 STAND_IN = f"""#!{sys.executable}
 import json, os, shutil, sys
 from pathlib import Path

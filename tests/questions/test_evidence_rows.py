@@ -18,7 +18,10 @@ from advsearch.runs.store import NAME, Store
 from advsearch.statistics.intervals import clopper_pearson
 from stored_sweeps import make_sweep
 
-pytestmark = pytest.mark.usefixtures("two_threads")
+pytestmark = [
+    pytest.mark.usefixtures("two_threads"),
+    pytest.mark.island("advsearch.questions.report", "advsearch.questions.explain"),
+]
 
 
 @pytest.mark.medium

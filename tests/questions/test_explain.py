@@ -22,6 +22,8 @@ from advsearch.runs.summary import read_result
 from samples import sweep
 from stored_sweeps import described
 
+pytestmark = pytest.mark.island("advsearch.questions.explain")
+
 HIGH = 60.0
 
 

@@ -25,7 +25,7 @@ from advsearch.questions.harden.training import ClassifierTrainer
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.summary import read_result
 
-pytestmark = pytest.mark.medium
+pytestmark = [pytest.mark.medium, pytest.mark.island("advsearch.questions.harden")]
 
 SMALL: dict[str, Any] = {
     "object": "ball,book", "model": "small_models:Colours", "resolution": 32, "texture_resolution": 16, "epsilon": 0.03,

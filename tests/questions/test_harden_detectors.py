@@ -22,7 +22,7 @@ from advsearch.runs.files import write_png
 from advsearch.tasks import make_task
 from advsearch.tasks.boxes import DetectionTruth
 
-pytestmark = pytest.mark.usefixtures("two_threads")
+pytestmark = [pytest.mark.usefixtures("two_threads"), pytest.mark.island("advsearch.questions.harden")]
 
 SIDE, LABELS = 24, ("mug", "ball")
 TASK = {"name": "detection", "unit": "fractions"}

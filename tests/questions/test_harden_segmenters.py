@@ -17,7 +17,10 @@ from advsearch.questions.harden.scenes import SceneJobs
 from advsearch.tasks import make_task
 from advsearch.tasks.segmentation import Segmentation, SegmentationTruth
 
-pytestmark = pytest.mark.usefixtures("two_threads")
+pytestmark = [
+    pytest.mark.usefixtures("two_threads"),
+    pytest.mark.island("advsearch.questions.harden", "advsearch.tasks.segmentation"),
+]
 
 SIDE, LABELS = 16, ("background", "mug", "ball")
 

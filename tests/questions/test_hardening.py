@@ -50,6 +50,8 @@ from advsearch.scene.color import round_to_8_bit, to_uint8
 from advsearch.statistics.intervals import clopper_pearson
 from small_models import Colours
 
+pytestmark = pytest.mark.island("advsearch.questions.harden")
+
 LABELS = [f"class {number}" for number in range(14)]
 
 

@@ -18,7 +18,11 @@ from advsearch.testing import assert_no_worse, assert_suite
 from advsearch.trust.code import allow_code
 from advsearch.viewer.columns import read_columns
 
-pytestmark = [pytest.mark.usefixtures("two_threads"), pytest.mark.medium]
+pytestmark = [
+    pytest.mark.usefixtures("two_threads"),
+    pytest.mark.medium,
+    pytest.mark.island("advsearch.questions.report", "advsearch.questions.test"),
+]
 
 
 def test_they_are_told_and_not_counted(tmp_path: Path) -> None:

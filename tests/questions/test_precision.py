@@ -32,6 +32,8 @@ from advsearch.questions.precision.rule import (
 from advsearch.runs.listing import is_finished
 from advsearch.runs.summary import read_result
 
+pytestmark = pytest.mark.island("advsearch.questions.precision")
+
 SIZE = 400
 """Numbers in a synthetic picture."""
 TRUTH = 1.0 + 0.5 * np.sin(np.arange(SIZE))

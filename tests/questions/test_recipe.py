@@ -23,6 +23,8 @@ from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.summary import read_result
 from advsearch.statistics.intervals import clopper_pearson
 
+pytestmark = pytest.mark.island("advsearch.questions.recipe")
+
 TINY = """
 title: Is the mug seen?
 settings: {object: [mug, bowl], environment: [studio, noon], resolution: 16, spp: 1}

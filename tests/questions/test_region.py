@@ -15,7 +15,7 @@ from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
 from stand_ins import Impatient, rows
 
-pytestmark = pytest.mark.medium
+pytestmark = [pytest.mark.medium, pytest.mark.island("advsearch.questions.region")]
 
 SMALL: dict[str, Any] = {
     "object": "mug", "resolution": 32, "controls": "camera", "vary": "camera.azimuth,camera.elevation", "samples": 8,

@@ -19,6 +19,8 @@ from advsearch.questions.replay.result import PHOTOGRAPH, ReplayConfig, ReplayRo
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_configuration, read_result, write_configuration
 
+pytestmark = pytest.mark.island("advsearch.questions.replay")
+
 EASY = "small_models:easy"
 SHORT: dict[str, Any] = {
     "object": "mug", "model": EASY, "controls": {"texture": {"epsilon": 0.3}}, "steps": 6, "trials": 6,

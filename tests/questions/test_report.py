@@ -27,6 +27,13 @@ from advsearch.report.views import FAILED_SEARCH_ENDINGS, NO_PROOF, NOTHING_CLAI
 from advsearch.runs.results import Extent, Result
 from advsearch.runs.summary import to_json
 
+pytestmark = pytest.mark.island(
+    "advsearch.questions.report",
+    "advsearch.questions.explain",
+    "advsearch.questions.harden",
+    "advsearch.questions.replay",
+)
+
 ENDINGS = (
     *("found", "budget spent", "stalled", "not verified", "already wrong", "non-finite objective", "interrupted"),
     *("out of time", "done", "finished", "an ending of a later version"),

@@ -16,6 +16,8 @@ from advsearch.runs.files import write_png
 from advsearch.runs.summary import VERSIONS_NOTE, compute_file_digests
 from samples import make_run
 
+pytestmark = pytest.mark.island("advsearch.questions.report")
+
 
 def test_runs_become_a_page_markdown_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     good = make_run(tmp_path / "good", pictures=False, rows=False)

@@ -11,6 +11,8 @@ from advsearch.questions.explain.importance import find_importance
 from advsearch.rules import CountedRule, RuleCondition, estimate_interval, find_covered, find_rules, split_in_halves
 from stored_sweeps import seen
 
+pytestmark = pytest.mark.island("advsearch.questions.explain")
+
 NOISE = 0.05
 """Share of the answers that are turned round."""
 

@@ -16,6 +16,8 @@ from advsearch.runs.directory import find_run
 from advsearch.runs.summary import read_result
 from covering import only
 
+pytestmark = pytest.mark.island("advsearch.questions.stability")
+
 GROUPS = tuple(dict.fromkeys(case.group for case in ALL_CASES))
 CHEAP = [case for case in ALL_CASES if not case.slow]
 FEW = [case for group in GROUPS for case in [case for case in CHEAP if case.group == group][::3]]

@@ -16,8 +16,6 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.errors import InputError
-from advsearch.questions.report.evidence import collect_evidence
-from advsearch.questions.test.settings import SuiteConfig
 from advsearch.questions.twins import counting, rendering
 from advsearch.questions.twins.carry_out import parse_frames
 from advsearch.questions.twins.listing import Pinhole, read_photographs
@@ -28,6 +26,8 @@ from advsearch.report.views import get_view, list_remarks
 from advsearch.runs import twins as runs_twins
 from advsearch.runs.results import IN_PHOTOGRAPH, WITHOUT_OBJECT, Estimate, TwinAgreement, TwinEvidence, TwinMatch
 from small_models import SMALL_ATTACK, Finder
+
+pytestmark = pytest.mark.island("advsearch.questions.twins")
 
 PHOTOGRAPHS = Path(__file__).resolve().parents[2] / "scenes" / "photographs"
 SCENE = PHOTOGRAPHS / "test" / "000001"
@@ -222,9 +222,13 @@ def test_a_label_that_the_model_does_not_know_is_named_with_its_row(names: dict[
         advsearch.twins(PHOTOGRAPHS / "photographs.csv", model="small_models:easy", names=names)
 
 
+@pytest.mark.island("advsearch.questions.report", "advsearch.questions.test")
 @pytest.mark.medium
 def test_sweep_gate_and_evidence_state_what_the_run_of_twins_measured(tmp_path: Path) -> None:
     """Of one run of two models: the row of the model and its environment, and how it is put into words."""
+    from advsearch.questions.report.evidence import collect_evidence
+    from advsearch.questions.test.settings import SuiteConfig
+
     model = "small_models:easy"
     twins = advsearch.twins(
         PHOTOGRAPHS / "photographs.csv",

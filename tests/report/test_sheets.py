@@ -103,6 +103,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {name: folder / name for name in ("texture", "patch")}
 
 
+@pytest.mark.island("advsearch.controls.patch", "advsearch.cli.exporters.sheets")
 @pytest.mark.medium
 def test_a_texture_is_printed_in_pieces_of_their_real_size(runs: dict[str, Path]) -> None:
     pieces = make_printable_pieces(runs["texture"], 95.0)
@@ -121,6 +122,7 @@ def test_a_texture_is_printed_in_pieces_of_their_real_size(runs: dict[str, Path]
         assert {tuple(colour) for colour in middles.reshape(-1, 3)} <= known, piece.name
 
 
+@pytest.mark.island("advsearch.controls.patch", "advsearch.cli.exporters.sheets")
 def test_the_command_writes_a_pdf_and_says_what_it_needs(
     runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -701,7 +701,17 @@ def test_a_camera_of_another_shape_several_cameras_and_a_ground_are_refused(tmp_
         make_backdrop(np.zeros((24, 32, 3)))  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("control", ["camera", "environment", "sky", "haze", "background", "path"])
+@pytest.mark.parametrize(
+    "control",
+    [
+        "camera",
+        "environment",
+        pytest.param("sky", marks=pytest.mark.island("advsearch.controls.sky")),
+        pytest.param("haze", marks=pytest.mark.island("advsearch.controls.haze")),
+        pytest.param("background", marks=pytest.mark.island("advsearch.controls.background")),
+        pytest.param("path", marks=pytest.mark.island("advsearch.controls.path")),
+    ],
+)
 def test_controls_that_the_photograph_contradicts_are_refused(photograph: Path, control: str) -> None:
     scene = Scene(load_description("mug").with_backdrop(photograph))
     with pytest.raises(InputError, match=f"{control} and `backdrop=.*contradict each other: .*leave one"):

@@ -15,6 +15,8 @@ from advsearch.scene.importing import blender
 from advsearch.scene.importing.objects import import_object
 from advsearch.trust import programs
 
+pytestmark = pytest.mark.island("advsearch.scene.importing.blender")
+
 STAND_IN = f"""#!{sys.executable}
 import json, os, shutil, sys
 from pathlib import Path

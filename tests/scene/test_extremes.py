@@ -14,6 +14,8 @@ from advsearch.engine.gradients import make_smooth_loss
 from advsearch.questions.stability.scene import make_renderer, render_image
 from advsearch.scene.assets import EnvironmentAsset
 
+pytestmark = pytest.mark.island("advsearch.questions.stability")
+
 SIZE = 24
 
 EXTREME: dict[str, tuple[dict[str, Any], float]] = {

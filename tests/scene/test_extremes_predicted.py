@@ -22,6 +22,8 @@ from advsearch.questions.stability.scene import (
 from advsearch.questions.stability.scenes import FLASH
 from advsearch.scene.assets import EnvironmentAsset
 
+pytestmark = pytest.mark.island("advsearch.questions.stability")
+
 TRACED = 256
 """Samples a pixel of the traced pictures."""
 NIGHT = make_gray_environment(0.0)

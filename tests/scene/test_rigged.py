@@ -237,6 +237,7 @@ def space_of(path: Path, **settings: object) -> Any:
     return make_space([make_control("body", settings)], load_description(str(path)))
 
 
+@pytest.mark.island("advsearch.controls.body")
 def test_by_itself_the_control_plays_the_first_clip(tmp_path: Path) -> None:
     path = figure().write(tmp_path)
     space = space_of(path)

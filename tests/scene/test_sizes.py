@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from advsearch.controls.camera import CameraControl
-from advsearch.controls.path import PathControl
 from advsearch.engine.loading import load_scene, scene_to_settings
 from advsearch.scene import library
 from advsearch.scene.assembly import pose_mesh
@@ -78,7 +77,10 @@ def test_a_node_has_the_size_that_it_has_in_its_scene(tmp_path: Path) -> None:
     assert import_object(tmp_path / "room.glb").size_in_metres == pytest.approx(4.0, rel=1e-5)
 
 
+@pytest.mark.island("advsearch.controls.path")
 def test_a_path_of_a_file_is_in_metres(tmp_path: Path) -> None:
+    from advsearch.controls.path import PathControl
+
     way = tmp_path / "way.csv"
     way.write_text("time,x,y,z,look_x,look_y,look_z\n0,20,0,1,0,0,1\n2,10,0,1,0,0,1\n")
     scene = load_description(str(box(tmp_path, "sedan", 1.0)), "street", up="z", size=5.0)

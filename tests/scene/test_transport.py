@@ -127,8 +127,13 @@ def test_what_is_kept_small_says_the_same(texture: tuple[int, int], bytes_an_ent
 @pytest.mark.parametrize(
     ("controls", "options", "can_predict"),
     [
-        (["texture"], {}, True), (["patch"], {}, True), (["texture", "pose"], {}, False),
-        ({"texture": {}, "haze": {"density": 0.2}}, {}, False), (["texture"], {"denoise": "none"}, False),
+        (["texture"], {}, True),
+        pytest.param(["patch"], {}, True, marks=pytest.mark.island("advsearch.controls.patch")),
+        (["texture", "pose"], {}, False),
+        pytest.param(
+            {"texture": {}, "haze": {"density": 0.2}}, {}, False, marks=pytest.mark.island("advsearch.controls.haze")
+        ),
+        (["texture"], {"denoise": "none"}, False),
         (["texture"], {"estimators": {"texture": "adjoint"}}, False),
     ],
 )  # fmt: skip

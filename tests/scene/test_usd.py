@@ -22,7 +22,7 @@ from advsearch.scene.library import load_object
 from advsearch.scene.parts import PointLamp, SpotLamp
 
 needs_usd = pytest.mark.skipif(not usd.is_installed(), reason="usd-core is not installed: pip install 'advsearch[usd]'")
-pytestmark = [pytest.mark.medium, needs_usd]
+pytestmark = [pytest.mark.medium, needs_usd, pytest.mark.island("advsearch.scene.importing.usd")]
 PREVIEW = """
     def Material "{name}" {{
         token outputs:surface.connect = </Root/{name}/surface.outputs:surface>

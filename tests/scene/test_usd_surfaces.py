@@ -15,6 +15,8 @@ from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing.objects import read_parts
 from advsearch.scene.importing.parts import ImportedPart
 
+pytestmark = pytest.mark.island("advsearch.scene.importing.usd")
+
 usd_stage = pytest.importorskip("advsearch.scene.importing.usd.stage", exc_type=ImportError)
 
 SQUARE = "[(0,0,0), (1,0,0), (1,1,0), (0,1,0)]"

@@ -11,6 +11,8 @@ import advsearch
 from advsearch.tasks import Facts, Prediction, make_task
 from advsearch.tasks.answers import AnswerWithLogits, FreeAnswer, has_word
 
+pytestmark = pytest.mark.island("advsearch.tasks.answers")
+
 VOCABULARY = ("a", "mug", "cup", "bowl", ".")
 
 

@@ -18,6 +18,8 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.tasks import Facts, make_task
 from advsearch.tasks.command import Command
 
+pytestmark = pytest.mark.island("advsearch.tasks.command")
+
 SIDE = 24
 ASKED: dict[str, Any] = {
     "name": "command",

@@ -28,6 +28,8 @@ from advsearch.tasks.depth import (
 )
 from small_models import Ranger, answer, assert_slope, save_exported
 
+pytestmark = pytest.mark.island("advsearch.tasks.depth")
+
 HIGH, WIDE = 8, 10
 MASK = torch.zeros(HIGH, WIDE).bool()
 MASK[2:7, 3:7] = True

@@ -18,7 +18,7 @@ from advsearch.runs.store import Store
 from advsearch.tasks import Detection
 from small_models import SIDE, Finder, Painter, Slider, answer, save_exported
 
-pytestmark = pytest.mark.medium
+pytestmark = [pytest.mark.medium, pytest.mark.island("advsearch.questions.photographs", "advsearch.tasks.segmentation")]
 
 ALSO_SLOWLY = pytest.mark.parametrize(
     "asked", ["detection", pytest.param("segmentation", marks=pytest.mark.slow)], indirect=True

@@ -14,6 +14,8 @@ from advsearch.options import NOT_A_NUMBER
 from advsearch.tasks import Facts, Prediction, Sight
 from advsearch.tasks.segmentation import Segmentation, SegmentationTruth
 
+pytestmark = pytest.mark.island("advsearch.tasks.segmentation")
+
 NAMES = ("background", "bottle", "chair")
 TASK = Segmentation(labels=NAMES)
 MASK = torch.tensor([[0, 1, 1, 0], [0, 1, 1, 0]]).bool()

@@ -20,6 +20,8 @@ from advsearch.tasks import Facts
 from advsearch.tasks.similarity import ITSELF, SOMETHING_ELSE, TEMPERATURE, Similarity
 from small_models import SIDE, save_exported
 
+pytestmark = pytest.mark.island("advsearch.tasks.similarity")
+
 COLOURS = {"blue": (0.2, 0.3, 0.9), "green": (0.2, 0.8, 0.3), "red": (0.9, 0.2, 0.2)}
 NAMES = tuple(COLOURS)
 
@@ -112,6 +114,7 @@ OWN = {
 """How the library itself says what the features of a picture are."""
 
 
+@pytest.mark.island("advsearch.models.zoo")
 @pytest.mark.parametrize("architecture", OWN)
 def test_features_are_those_of_the_librarys_own_pipeline(architecture: str, tmp_path: Path) -> None:
     spec = published(tmp_path / "net", architecture)

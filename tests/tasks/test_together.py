@@ -19,6 +19,8 @@ from advsearch.tasks.segmentation import Segmentation
 from advsearch.tasks.together import EnsembleTask, join_models
 from small_models import SIDE, Finder, Painter, Ranger, answer, save_exported
 
+pytestmark = pytest.mark.island("advsearch.tasks.depth", "advsearch.tasks.segmentation")
+
 BOTH = {"name": "detection+depth", "depth": {"kind": DISPARITY}}
 
 

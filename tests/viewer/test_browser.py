@@ -18,13 +18,8 @@ import pytest
 from PIL import Image
 
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.explain.result import ExplainResult
-from advsearch.questions.harden.result import HardenResult
-from advsearch.questions.photographs.carry_out import Photographs
-from advsearch.questions.recipe.result import RecipeResult
-from advsearch.questions.replay.result import ReplayResult
-from advsearch.questions.stability.result import StabilityResult
 from advsearch.questions.sweep.page import write_bundle
+from advsearch.registry import EXPERIMENTS
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import Result
 from advsearch.runs.store import CachedEvaluation, Row, Store
@@ -36,13 +31,13 @@ from samples import (
     EXPLAIN,
     HARDEN,
     RECIPE,
+    REGION,
     REPLAY,
     STABILITY,
     curve,
     keep_object,
     make_run,
     matrix,
-    region,
     written_page,
 )
 from samples import attack as attack_with
@@ -360,13 +355,18 @@ def test_everybody_can_use_the_pages(
         assert faults(page) == []
 
 
+STORED = {
+    "region": REGION, "explain": EXPLAIN, "harden": HARDEN, "recipe": RECIPE, "replay": REPLAY, "stability": STABILITY
+}  # fmt: skip
+"""Results of experiments that may not be there, by command."""
+
+
 @pytest.mark.medium
 @pytest.mark.parametrize(
     "result",
     [
-        matrix(), curve(), region(), ExplainResult.from_values(EXPLAIN),
-        HardenResult.from_values(HARDEN), RecipeResult.from_values(RECIPE),
-        ReplayResult.from_values(REPLAY), StabilityResult.from_values(STABILITY),
+        matrix(), curve(),
+        *(EXPERIMENTS[name].result.from_values(values) for name, values in STORED.items() if name in EXPERIMENTS),
     ],
     ids=lambda result: type(result).__name__,
 )  # fmt: skip
@@ -405,9 +405,12 @@ def test_intervals_over_drives_are_those_of_the_summary(browser: Browser) -> Non
         assert mine == pytest.approx(rate_interval(right, of), abs=1e-6), units
 
 
+@pytest.mark.island("advsearch.questions.photographs")
 @pytest.mark.medium
 def test_a_photograph_is_aligned_taken_and_counted(browser: Browser, tmp_path: Path) -> None:
     """With a camera that isn't there, over HTTPS as a phone has it; and everybody can use the page."""
+    from advsearch.questions.photographs.carry_out import Photographs
+
     run = make_sweep(tmp_path / "first", keep="all")
     settings: dict[str, Any] = {"ignore_https_errors": True, "bypass_csp": True}
     with serving(run, host="0.0.0.0", photographs=Photographs()) as server:

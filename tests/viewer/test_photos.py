@@ -27,6 +27,8 @@ from advsearch.viewer.clients import MAX_BODY_BYTES
 from advsearch.viewer.server import Dashboard
 from stored_sweeps import make_sweep, serving
 
+pytestmark = pytest.mark.island("advsearch.questions.photographs")
+
 
 def picture(size: tuple[int, int] = (64, 48), format: str = "JPEG", level: int = 128) -> bytes:
     """A grey picture as a file."""

@@ -1,5 +1,7 @@
 """The dashboard's server: what it answers, and what it refuses."""
 
+from __future__ import annotations
+
 import os
 import shutil
 import socket
@@ -11,16 +13,19 @@ from functools import partial
 from http.client import HTTPConnection, HTTPResponse, HTTPSConnection
 from pathlib import Path
 from ssl import _create_unverified_context
+from typing import TYPE_CHECKING
 
 import pytest
 
 from advsearch.errors import InputError
-from advsearch.questions.photographs.result import PhotoAgreement
 from advsearch.viewer import clients
 from advsearch.viewer.document import has_other_scripts
 from advsearch.viewer.server import Dashboard
 from samples import make_run, written_page
 from stored_sweeps import make_sweep, serving
+
+if TYPE_CHECKING:
+    from advsearch.questions.photographs.result import PhotoAgreement
 
 
 def ask(server: Dashboard, path: str, method: str = "GET", **headers: str) -> tuple[HTTPResponse, bytes]:
@@ -199,6 +204,7 @@ def test_who_takes_no_answer_keeps_nobody_out(run: Path, monkeypatch: pytest.Mon
         assert ask(server, "/runs/first/cover")[0].status == 200
 
 
+@pytest.mark.island("advsearch.questions.photographs")
 @pytest.mark.medium
 @pytest.mark.parametrize(
     ("path", "kind", "own"),
@@ -235,6 +241,8 @@ class NoPhotographs:
         raise InputError("none")
 
     def agreement(self, run: Path) -> PhotoAgreement:
+        from advsearch.questions.photographs.result import PhotoAgreement
+
         return PhotoAgreement.from_values(
             dict.fromkeys(("photos", "right_right", "right_wrong", "wrong_right", "wrong_wrong"), 0)
             | {"agreement": None, "interval": None, "renderings": []}

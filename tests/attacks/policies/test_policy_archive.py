@@ -12,6 +12,8 @@ from torch import Tensor
 from advsearch.attacks import Block, Domain, Evaluation, Query, make_policy, search
 from advsearch.attacks.policies.archive import ArchiveState, MapElites
 
+pytestmark = pytest.mark.island("advsearch.attacks.policies.archive")
+
 SIDE = 10
 """Cells over each of the first two numbers."""
 

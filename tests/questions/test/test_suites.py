@@ -35,6 +35,8 @@ from advsearch.runs.store import Store
 from advsearch.runs.summary import read_result
 from advsearch.testing import assert_no_worse, assert_right
 
+pytestmark = pytest.mark.island("advsearch.questions.test")
+
 carry_out = get_experiment("test").run
 EASY, HARD = "small_models:easy", "small_models:hard"
 SMALL: dict[str, Any] = {"resolution": 32, "denoise": "none"}
@@ -339,6 +341,7 @@ def test_assertions_pass_and_fail_with_the_picture_and_what_repeats_them(
         assert_no_worse("mug", easy, always(), points=20.0, pictures=13, controls=FRONT, **small)
 
 
+@pytest.mark.island("advsearch.controls.path")
 def test_a_share_of_the_frames_of_a_drive_is_claimed_as_one(tmp_path: Path) -> None:
     way = {"path": {"path": "approach", "reach": 2.0}}
     suite = written(tmp_path, {"on-the-way": claim("right", way, at_least=0.5, pictures=20)}, confidence=0.9)
