@@ -26,6 +26,8 @@ from advsearch.cluster.workers import CLUSTERS, open_workers
 from advsearch.errors import ClusterError, FileFormatError, InputError
 from conftest import ROOT
 
+pytestmark = pytest.mark.island("advsearch.cluster.dask_executor")
+
 psutil: Any = import_module("psutil")  # which Dask brings along
 dask: Any = import_module("dask")
 distributed: Any = import_module(

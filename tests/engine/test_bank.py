@@ -19,6 +19,8 @@ from advsearch.questions.attack.result import AttackResult
 from advsearch.scene.predictor import Refusal
 from stand_ins import Impatient, rows
 
+pytestmark = pytest.mark.island("advsearch.predictors.bank", "advsearch.predictors.surface_light")
+
 SMALL: dict[str, Any] = {
     "resolution": 32,
     "controls": {"texture": {"resolution": 4}},

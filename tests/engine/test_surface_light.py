@@ -20,7 +20,7 @@ from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
 from stand_ins import Impatient, rows, shared
 
-pytestmark = pytest.mark.medium
+pytestmark = [pytest.mark.medium, pytest.mark.island("advsearch.predictors.surface_light")]
 
 SMALL: dict[str, Any] = {
     "resolution": 32,

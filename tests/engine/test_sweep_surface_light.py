@@ -25,6 +25,8 @@ from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
 from stand_ins import rows
 
+pytestmark = pytest.mark.island("advsearch.predictors.surface_light")
+
 SMALL: dict[str, Any] = {"resolution": 24, "trials": 0, "batch": 4}
 
 

@@ -17,6 +17,8 @@ from advsearch.scene.predictor import RefusalCause
 from advsearch.scene.renderer import Renderer
 from small_models import levels
 
+pytestmark = pytest.mark.island("advsearch.predictors.surface_light")
+
 SIDE = 32
 VARYING = ["camera", "environment"]
 

@@ -15,7 +15,10 @@ from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
 from stand_ins import Impatient, rows
 
-pytestmark = [pytest.mark.medium, pytest.mark.island("advsearch.questions.region")]
+pytestmark = [
+    pytest.mark.medium,
+    pytest.mark.island("advsearch.questions.region", "advsearch.predictors.surface_light"),
+]
 
 SMALL: dict[str, Any] = {
     "object": "mug", "resolution": 32, "controls": "camera", "vary": "camera.azimuth,camera.elevation", "samples": 8,

@@ -22,7 +22,7 @@ from advsearch.questions.stability.scene import (
 from advsearch.questions.stability.scenes import FLASH
 from advsearch.scene.assets import EnvironmentAsset
 
-pytestmark = pytest.mark.island("advsearch.questions.stability")
+pytestmark = pytest.mark.island("advsearch.questions.stability", "advsearch.predictors.surface_light")
 
 TRACED = 256
 """Samples a pixel of the traced pictures."""

@@ -22,6 +22,8 @@ from advsearch.scene.geometry import camera_to_world, compute_object_to_world
 from advsearch.scene.photograph_files import read_photograph_folder, read_photograph_view
 from advsearch.trust import stored_files
 
+pytestmark = pytest.mark.island("advsearch.controls.backdrop")
+
 BOX = str(samples.PHOTOGRAPHS / "models" / "obj_000002.ply")
 NAMES = [f"{number:06d}.jpg" for number in (1, 3, 5, 7, 9, 11)]
 

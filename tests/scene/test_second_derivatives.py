@@ -16,7 +16,6 @@ from torch import Tensor
 
 import advsearch
 from advsearch.controls.geometry import _Solve
-from advsearch.predictors.surface_light.arrangement import multiply_sparse
 from advsearch.scene.color import LINEAR_LIMIT, linear_to_srgb
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.mitsuba_backend.transport import PathVertices
@@ -32,6 +31,8 @@ def solved() -> Callable[[Tensor], Tensor]:
 
 
 def sparse() -> Callable[[Tensor], Tensor]:
+    from advsearch.predictors.surface_light.arrangement import multiply_sparse
+
     matrix = scipy.sparse.random(7, 5, 0.5, "csr", random_state=0)
     return lambda x: multiply_sparse(matrix, x.reshape(5, 2))
 
@@ -53,7 +54,10 @@ OPERATIONS = {"_Solve": [solved], "LinearMap": [sparse, transport]}
 """Not linear: the tests at the end have them."""
 
 
-@pytest.mark.parametrize("made", [one for several in OPERATIONS.values() for one in several])
+IN_AN_ISLAND = pytest.param(sparse, marks=pytest.mark.island("advsearch.predictors.surface_light"))
+
+
+@pytest.mark.parametrize("made", [solved, IN_AN_ISLAND, transport])
 def test_an_exact_operation_is_differentiated_any_number_of_times(made: Any) -> None:
     """As the dense matrix of the same numbers is: of the sum of cubes, three times."""
     operation = made()

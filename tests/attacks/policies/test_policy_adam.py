@@ -10,6 +10,8 @@ from torch import Tensor
 from advsearch.attacks import Adam, Block, Domain, Evaluation, Query, make_policy, search
 from advsearch.errors import InputError
 
+pytestmark = pytest.mark.island("advsearch.attacks.policies.adam")
+
 
 def path(domain: Domain, slope: Tensor, policy: Adam, steps: int) -> list[Tensor]:
     seen: list[Tensor] = []
