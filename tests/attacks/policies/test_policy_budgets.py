@@ -72,5 +72,10 @@ def test_the_policy_of_the_page_works() -> None:
     result = search(partial(map, problem.evaluate), problem.domain, own, steps=400, seed=0, candidates=0)
     assert problem.value(result.best_u) > 0.9 * problem.optimum
     assert result.stopped is Ending.BUDGET_SPENT
-    beside = make_policy("portfolio", policies=[own, "auto"])
+
+
+@pytest.mark.island("advsearch.attacks.policies.portfolio")
+def test_the_policy_of_the_page_is_one_of_a_portfolio() -> None:
+    problem = closed_form.OBJECTIVES["quadratic, box"](6, 0)
+    beside = make_policy("portfolio", policies=[users_class()(), "auto"])
     assert search(partial(map, problem.evaluate), problem.domain, beside, steps=40, seed=0).best_objective > 0.0

@@ -17,7 +17,6 @@ from advsearch.attacks import (
     Policy,
     Query,
     SearchResult,
-    Sobol,
     search,
     seeded,
 )
@@ -94,9 +93,12 @@ def test_a_grid_of_given_size_and_a_grid_that_does_not_fit() -> None:
         Grid(points=1)
 
 
+@pytest.mark.island("advsearch.attacks.policies.sobol")
 @pytest.mark.parametrize("d", [1, 2, 3])
 def test_an_l2_ball_is_filled_evenly(d: int) -> None:
     """The radius to the power d is uniform, and the mean direction is nothing."""
+    from advsearch.attacks import Sobol
+
     domain = Domain(torch.full((d,), 0.5), (Block(d, "l2", 0.1),))
     seen, _ = points(Sobol(), domain, 1024)
     share = ((seen - 0.5).norm(dim=1) / 0.1) ** d
@@ -106,9 +108,10 @@ def test_an_l2_ball_is_filled_evenly(d: int) -> None:
     assert abs(angles - 512) < 16
 
 
+@pytest.mark.island("advsearch.attacks.policies.sobol")
 def test_sobol_beats_random_in_two_dimensions() -> None:
     """The largest empty disc is smaller: the worst of 500 places is nearer to one of 64 points."""
-    from advsearch.attacks import Random
+    from advsearch.attacks import Random, Sobol
 
     domain = Domain(torch.full((2,), 0.5), (Block(2),))
     places = torch.rand(500, 2, generator=seeded(0, 0))

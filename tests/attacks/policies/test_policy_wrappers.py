@@ -7,10 +7,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.attacks import NES, PGD, Block, Domain, Evaluation, Query, Restarts, search, seeded
+from advsearch.attacks import NES, PGD, Block, Domain, Evaluation, Query, search, seeded
 
 
+@pytest.mark.island("advsearch.attacks.policies.restarts")
 def test_restarts_find_the_higher_of_two_hills() -> None:
+    from advsearch.attacks import Restarts
+
     def value(u: Tensor) -> float:
         return math.exp(-20 * float((u - 0.2).square().sum())) + 2 * math.exp(-20 * float((u - 0.85).square().sum()))
 
