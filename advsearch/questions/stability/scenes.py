@@ -21,6 +21,7 @@ from advsearch.extend import (
     errors,
     geometry,
     gradients,
+    policies,
     workbench,
 )
 from advsearch.questions.stability.result import (
@@ -224,7 +225,9 @@ def leave_plateau(low: float, high: float) -> CaseOutcome:
     checks = []
     endings = []
     n_flat = 0
-    for policy in map(workbench.make_policy, ("pgd", "adam", "auto")):
+    # `adam` is a part that may be absent
+    names = [name for name in ("pgd", "adam", "auto") if name in policies.POLICIES]
+    for policy in map(workbench.make_policy, names):
         result = run_search(
             renderer, _darkness, PLATEAU_STEPS, spp=2, start=start, policy=policy
         )
