@@ -479,9 +479,9 @@ def _choose_refusal(
     if find_matrix_refusal(problem, steps=None, specialise=True) is None:
         return matrix_refusal
     for _method, refusal in refusals:
-        is_helpful = refusal is not None and refusal.cause not in UNHELPFUL_CAUSES
-        # That of a bank of matrices is the one of matrices.
-        if refusal is not None and is_helpful and refusal != matrix_refusal:
+        if refusal is None or refusal.cause in UNHELPFUL_CAUSES:
+            continue
+        if refusal != matrix_refusal:  # that of a bank of matrices is the same
             return refusal
     return matrix_refusal
 
