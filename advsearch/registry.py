@@ -195,7 +195,7 @@ def get_class(kind: str, name: str) -> Any:
     for part in list_built_ins(kind).values():
         if part.import_path.endswith(f":{name}"):
             return load_attribute(part.import_path)
-    raise AttributeError(f"there is no {kind} with a class {name}")
+    raise AttributeError(f"there is no {name!r}, and no {kind} with such a class")
 
 
 EXPERIMENTS: Registry[Any] = Registry(

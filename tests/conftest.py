@@ -203,7 +203,8 @@ class WithoutIslands:
         """Leave out the other tests that need one."""
         needing = [one for one in items if any(self.needs.intersection(m.args) for m in one.iter_markers("island"))]
         config.hook.pytest_deselected(items=needing)
-        items[:] = [one for one in items if one not in needing]
+        left_out = set(needing)
+        items[:] = [one for one in items if one not in left_out]
 
     def pytest_report_header(self) -> str:
         return f"{len(self.islands)} islands are hidden"

@@ -56,8 +56,8 @@ def island_of_module() -> dict[str, str]:
 def find_island(module: str) -> str | None:
     """Return the island that a module belongs to: its own, or that of a package that it is in."""
     islands = island_of_module()
-    module = ELSEWHERE.get(module, module)
     while module:
+        module = ELSEWHERE.get(module, module)
         if module in islands:
             return module
         module = module.rpartition(".")[0]

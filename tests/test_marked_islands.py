@@ -21,13 +21,14 @@ def read_test_files() -> dict[str, ast.Module]:
 
 
 def imported_islands(node: ast.AST) -> set[str]:
-    """Return the islands that a part of a file imports by `from`."""
-    found = set[str]()
+    """Return the islands that a part of a file imports."""
+    names = list[str]()
     for one in ast.walk(node):
         if isinstance(one, ast.ImportFrom) and one.module:
-            names = (f"{one.module}.{alias.name}" for alias in one.names)
-            found.update(island for name in names if (island := find_island(name)) is not None)
-    return found
+            names += [f"{one.module}.{alias.name}" for alias in one.names]
+        if isinstance(one, ast.Import):
+            names += [alias.name for alias in one.names]
+    return {island for name in names if (island := find_island(name)) is not None}
 
 
 def missing_marks() -> Iterator[str]:
@@ -38,7 +39,7 @@ def missing_marks() -> Iterator[str]:
             marks = set(of_file)
             if isinstance(node, ast.FunctionDef):
                 marks.update(*map(list_marks, node.decorator_list))
-            is_checked = isinstance(node, ast.ImportFrom) or getattr(node, "name", "").startswith("test_")
+            is_checked = isinstance(node, (ast.Import, ast.ImportFrom)) or getattr(node, "name", "").startswith("test_")
             if is_checked and "all" not in marks:
                 yield from (f"{name}, line {node.lineno}: {island}" for island in imported_islands(node) - marks)
 

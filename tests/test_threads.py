@@ -64,7 +64,10 @@ def test_a_file_that_asks_for_very_many_threads_gets_a_few_for_each_core() -> No
 
 @pytest.mark.medium
 @pytest.mark.parametrize("photograph", [False, True])
-@pytest.mark.parametrize("control", ["light", "material", "texture", "spot"])
+@pytest.mark.parametrize(
+    "control",
+    ["light", "material", "texture", pytest.param("spot", marks=pytest.mark.island("advsearch.controls.projector"))],
+)
 def test_an_adjoint_does_not_depend_on_the_number_of_threads(control: str, photograph: bool, tmp_path: Path) -> None:
     """It is added up by several threads: of small sums Dr.Jit has a copy for each, unless it is told otherwise."""
     import torch

@@ -15,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Future
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import islice
 from typing import Any
 
@@ -70,8 +70,12 @@ __all__ = [
 CLUSTERS: Registry[type[ClusterExecutor]] = Registry(
     "advsearch.clusters",
     list_built_ins("cluster"),
-    "a subclass of ClusterExecutor",
-    lambda name, entry: isinstance(entry, type) and issubclass(entry, ClusterExecutor),
+    "a subclass of ClusterExecutor with `expected_values`",
+    lambda name, entry: (
+        isinstance(entry, type)
+        and issubclass(entry, ClusterExecutor)
+        and hasattr(entry, "expected_values")
+    ),
 )
 """Executors on clusters, imported when a cluster is opened."""
 
@@ -424,9 +428,13 @@ def _find_executor_class(cluster: str) -> type[ClusterExecutor]:
     Raises:
         InputError: there is none, or an entry that may read it cannot be imported.
     """
-    for executor_class in CLUSTERS.list_usable().values():
-        if executor_class.reads(cluster):
-            return executor_class
+    for (
+        name
+    ) in CLUSTERS:  # one after the other, so that no more than needed are imported
+        with suppress(InputError):
+            executor_class = CLUSTERS[name]
+            if executor_class.reads(cluster):
+                return executor_class
     # An entry that cannot be imported raises its error here.
     values = [value for name in CLUSTERS for value in CLUSTERS[name].expected_values]
     if not values:

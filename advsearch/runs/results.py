@@ -784,7 +784,8 @@ class LinearTransport(Fields):
     used: bool
     method: str | None = optional_field(
         "method of prediction: `matrix`, `basis pictures` (for a sweep), `surface "
-        "light`, or `crop`, which renders a part of each picture"
+        "light`, `crop`, which renders a part of each picture, or that of an added "
+        "predictor"
     )
     reason: str | None = optional_field(
         "why pictures were rendered, all or after some evaluation, or were not "

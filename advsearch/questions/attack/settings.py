@@ -352,7 +352,8 @@ class AttackConfig(DerivativeConfig):
         None,
         "run",
         "where the workers are",
-        "the address of a Dask scheduler, local, or a .yaml file",
+        "the address of a Dask scheduler, local, a .yaml file, or what an added "
+        "cluster reads",
         metavar="PLACE",
         otherwise="this machine, if there are `workers`",
         min_length=1,

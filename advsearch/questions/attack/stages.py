@@ -92,9 +92,9 @@ def plan_renders(
     """Choose light bounces, gradient estimators and samples of a search by measurement.
 
     The choice is set in the journal's problem and stored, so that a run that is
-    continued uses the same. Bounces are measured only if light on surfaces cannot
-    predict the images of the search. Gradient estimators are measured if matrices of
-    light transport cannot, or if a full measurement is requested.
+    continued uses the same. Bounces are measured only if no method that always has all
+    bounces may predict the images of the search. Gradient estimators are measured if
+    matrices of light transport cannot, or if a full measurement is requested.
 
     Args:
         policy: policy of the search. Gradients are measured only if it uses them.
@@ -163,27 +163,11 @@ def _pays_to_measure_bounces(
         return True
     # If a method that always has all bounces may predict the images, then none are left
     # out.
-    refusals = _find_refusals(problem, policy)
+    methods = [method for method in make_methods() if not method.follows_bounces]
     return all(
-        method.follows_bounces or refusal is not None for method, refusal in refusals
+        method.find_search_refusal(problem, problem.steps, policy) is not None
+        for method in methods
     )
-
-
-def _find_refusals(
-    problem: Problem, policy: Policy[Any]
-) -> list[tuple[PredictionMethod, Refusal | None]]:
-    """Return every method, and why it does not predict the images of a search.
-
-    The refusal is None if it may predict them.
-
-    Args:
-        problem: problem of the search, whose images are not composed of several.
-        policy: policy of the search.
-    """
-    return [
-        (method, method.find_search_refusal(problem, problem.steps, policy))
-        for method in make_methods()
-    ]
 
 
 def _pays_to_measure_gradients(
@@ -405,14 +389,45 @@ def choose_predictor(
     """
     problem = journal.problem
     refusal = find_general_refusal(problem, specialise)
-    if refusal is not None:
-        return _render_search(problem, refusal, stages, findings, specialise=specialise)
-    refusals = _find_refusals(problem, policy)
-    candidates = [method for method, refusal in refusals if refusal is None]
-    for index, method in enumerate(candidates):
+    if refusal is not None and not specialise:  # renders are not cropped either
+        _report_rendering(refusal, stages, findings)
+        return None
+    if refusal is None:
+        refusals = [
+            (method, method.find_search_refusal(problem, problem.steps, policy))
+            for method in make_methods()
+        ]
+        candidates = [method for method, refusal in refusals if refusal is None]
+        tried = _try_methods(candidates, journal, stages, findings, clean)
+        if isinstance(tried, PredictedSearch):
+            return tried
+        refusal = tried or _choose_refusal(problem, refusals)
+    return _crop_search(problem, refusal, stages, findings)
+
+
+def _try_methods(
+    methods: Sequence[PredictionMethod],
+    journal: Journal,
+    stages: Stages,
+    findings: RunState,
+    clean: CleanMatrix,
+) -> PredictedSearch | Refusal | None:
+    """Prepare predictors in turn until one is accurate, or takes too much memory.
+
+    See `choose_predictor` for the other arguments.
+
+    Args:
+        methods: methods that may predict the images, the cheapest first.
+
+    Returns:
+        The accurate predictor; else why the last one that was tried is not used. None
+        without methods.
+    """
+    refusal = None
+    for index, method in enumerate(methods):
         predictor = method.make_search(
-            problem,
-            problem.steps,
+            journal.problem,
+            journal.problem.steps,
             collect_light=journal.evaluator,
             clean_matrix=clean,
         )
@@ -420,35 +435,10 @@ def choose_predictor(
         if refusal is None:
             return predictor
         if refusal.cause is RefusalCause.TOO_LARGE:
-            return _crop_search(problem, refusal, stages, findings)
+            return refusal
         findings.inaccuracy_refusal = refusal
-        _report_inaccuracy(refusal, stages, candidates[index + 1 :])
-
-    refusal = findings.inaccuracy_refusal
-    if refusal is None:
-        refusal = _choose_refusal(problem, refusals)
-    return _crop_search(problem, refusal, stages, findings)
-
-
-def _render_search(
-    problem: Problem,
-    refusal: Refusal,
-    stages: Stages,
-    findings: RunState,
-    *,
-    specialise: bool,
-) -> PredictedSearch | None:
-    """Prepare a search whose images are rendered, in part if renders may be cropped.
-
-    See `_crop_search` for the other arguments and for what is returned.
-
-    Args:
-        specialise: whether renders may leave out what the search does not need.
-    """
-    if not specialise:
-        _report_rendering(refusal, stages, findings)
-        return None
-    return _crop_search(problem, refusal, stages, findings)
+        _report_inaccuracy(refusal, stages, methods[index + 1 :])
+    return refusal
 
 
 def _report_inaccuracy(
@@ -474,8 +464,8 @@ def _choose_refusal(
     """
     matrix_refusal = find_matrix_refusal(problem, problem.steps, specialise=True)
     if matrix_refusal is None:
-        # A matrix could predict each condition; the predictor that does is missing.
-        matrix_refusal = Refusal("conditions vary, and there is no predictor `bank`")
+        # A matrix could predict each condition, and a predictor that does is missing.
+        matrix_refusal = Refusal("no predictor for conditions that vary is installed")
     if find_matrix_refusal(problem, steps=None, specialise=True) is None:
         return matrix_refusal
     for _method, refusal in refusals:

@@ -714,7 +714,7 @@ def _prediction_method_text(summary: AttackSummary, method: str | None) -> str:
         return "only the part of each picture was rendered that can change"
     if method == "surface light":
         return f"light on surfaces predicted {n_predicted}"
-    if method == "matrix":
+    if method in (None, "matrix"):
         return f"a matrix predicted {n_predicted}"
     return f"the predictor {method!r} predicted {n_predicted}"
 

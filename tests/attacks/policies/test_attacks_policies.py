@@ -242,7 +242,7 @@ def test_the_classes_of_all_policies_are_offered_by_their_packages() -> None:
     for part in list_built_ins("policy").values():
         name = part.import_path.rpartition(":")[2]
         assert getattr(attacks, name) is getattr(policies, name) is POLICIES[part.name]
-    with pytest.raises(AttributeError, match="no policy with a class Annealing"):
+    with pytest.raises(AttributeError, match="there is no 'Annealing', and no policy with such a class"):
         attacks.Annealing  # noqa: B018
 
 

@@ -15,7 +15,6 @@ NUMBERS = Domain(torch.tensor([0.3, 0.6, 0.5, 0.5]), (Block(2), Block(2, "linf",
 CHOICES = Domain(torch.tensor([0.2, 0.1, 0.9]), (Block(1, n_options=3), Block(1), Block(1, n_options=2)))
 COSTLY = Domain(torch.tensor([0.3, 0.6]), (Block(2),), gradient_cost=4)
 DOMAINS = {"numbers": NUMBERS, "choices": CHOICES, "differences": COSTLY}
-SMALL_PORTFOLIO = {"name": "portfolio", "policies": ["pgd", "nes"]}
 RACES: dict[str, dict[str, Any]] = {
     "restarts of nes": {"name": "restarts", "policy": "nes"},
     "restarts of auto": {"name": "restarts", "policy": "auto", "times": 3},
