@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from advsearch.attacks.domain import Block, Domain
 from advsearch.attacks.evaluation import (
@@ -40,18 +40,9 @@ from advsearch.attacks.verification import (
 from advsearch.registry import get_class
 from advsearch.statistics.intervals import clopper_pearson
 
-if TYPE_CHECKING:
-    from advsearch.attacks.policies.adam import Adam as Adam
-    from advsearch.attacks.policies.archive import MapElites as MapElites
-    from advsearch.attacks.policies.mixture import Mixture as Mixture
-    from advsearch.attacks.policies.portfolio import Portfolio as Portfolio
-    from advsearch.attacks.policies.restarts import Restarts as Restarts
-    from advsearch.attacks.policies.sobol import Sobol as Sobol
-else:  # a type checker would accept any name
-
-    def __getattr__(name: str) -> Any:
-        """Import the class of a policy that is an island on first use."""
-        return get_class("policy", name)
+def __getattr__(name: str) -> Any:
+    """Import the class of a policy that is an island on first use."""
+    return get_class("policy", name)
 
 
 __all__ = [

@@ -199,7 +199,7 @@ def test_surroundings_that_change_are_rendered_again_and_then_always(monkeypatch
     def measure_outside(*arguments: Any) -> Deviation:
         return replace(measure(*arguments), levels=next(deviations))
 
-    for module in ("windows", "transport"):
+    for module in ("windows", "prediction"):
         monkeypatch.setattr(f"advsearch.engine.{module}.measure_outside", measure_outside)
     summary = attack_once(AttackConfig(**{**SMALL, "steps": 44})).summary
     assert summary.transport is not None and summary.transport.renewed == 1

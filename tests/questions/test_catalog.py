@@ -17,17 +17,10 @@ from advsearch import registry
 from advsearch.catalog import BUILT_INS, is_module_installed
 from advsearch.experiment import Experiment
 from advsearch.settings import HEADER
+from test_islands import CORE
 
 PACKAGE = Path(advsearch.__file__).parent
-CORE = ("attack", "sweep", "render")
-REMOVABLE = [part for part in BUILT_INS if part.kind == "experiment" and part.name not in CORE]
-CORE_PARTS = {
-    "control": "pose camera texture material light environment geometry",
-    "policy": "random grid pgd adam cmaes nes auto sobol restarts portfolio",
-    "task": "classification detection",
-    "reader": "obj ply stl gltf glb vrm",
-}
-"""Parts that are not removed, those in their modules included."""
+REMOVABLE = [part for part in BUILT_INS if part.kind == "experiment" and part.name not in CORE["experiment"]]
 
 
 @pytest.mark.island("all")
@@ -105,7 +98,7 @@ def list_removable_modules() -> dict[str, list[str]]:
     """Return the modules of parts outside the core, each with its parts as "kind name"."""
     found: dict[str, list[str]] = {}
     for part in BUILT_INS:
-        is_core = part.name in CORE_PARTS.get(part.kind, "").split()
+        is_core = part.name in CORE[part.kind]
         if part.kind not in ("experiment", "model source") and not is_core:
             found.setdefault(part.import_path.partition(":")[0], []).append(f"{part.kind} {part.name}")
     return found
@@ -127,7 +120,7 @@ def test_without_all_removable_parts_the_tool_works(tmp_path: Path) -> None:
         [*ATTACK, *SMALL, "attacked", "--json"],
         ["export", "attacked", "--out", "rows.csv"],
     )
-    assert [line.split()[0] for line in listed[1].splitlines()] == CORE_PARTS["control"].split()
+    assert {line.split()[0] for line in listed[1].splitlines()} == CORE["control"]
     assert [status for status, _, _ in done] == [0, 0, 0], done
 
 

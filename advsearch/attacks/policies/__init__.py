@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import is_dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from advsearch.attacks.candidates import (
     Failures,
@@ -125,18 +125,9 @@ def _make_nested_policy(spec: Spec, where: str) -> Policy[Any]:
     return make_policy(str(spec["name"]), **options)
 
 
-if TYPE_CHECKING:
-    from advsearch.attacks.policies.adam import Adam as Adam
-    from advsearch.attacks.policies.archive import MapElites as MapElites
-    from advsearch.attacks.policies.mixture import Mixture as Mixture
-    from advsearch.attacks.policies.portfolio import Portfolio as Portfolio
-    from advsearch.attacks.policies.restarts import Restarts as Restarts
-    from advsearch.attacks.policies.sobol import Sobol as Sobol
-else:  # a type checker would accept any name
-
-    def __getattr__(name: str) -> Any:
-        """Import the class of a policy that is an island on first use."""
-        return get_class("policy", name)
+def __getattr__(name: str) -> Any:
+    """Import the class of a policy that is an island on first use."""
+    return get_class("policy", name)
 
 
 __all__ = [
