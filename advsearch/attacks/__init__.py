@@ -40,6 +40,7 @@ from advsearch.attacks.verification import (
 from advsearch.registry import get_class
 from advsearch.statistics.intervals import clopper_pearson
 
+
 def __getattr__(name: str) -> Any:
     """Import the class of a policy that is an island on first use."""
     return get_class("policy", name)
